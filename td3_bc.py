@@ -6,7 +6,7 @@ The policy maximises Q and stays near the dataset's actions:
     pi = argmax E[ lmbda * Q(s, pi(s)) - (pi(s) - a)^2 ]  (eq. 4 of Peng et al., AAAI 2023, called the paper below)
 """
 
-import copy, csv, fcntl, hashlib, io, json, os, signal, socket, sys, time, zipfile
+import copy, csv, fcntl, hashlib, io, json, os, signal, socket, sys, threading, time, zipfile
 from collections import defaultdict
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -114,7 +114,7 @@ def dataset_path(args):
 
 def read_column(file, key, rows, width):
     """`file[key]` as finite float32 (rows, width); exits with a sentence where it is not."""
-    shape = file[key].shape if key in file else "missing"
+    shape = getattr(file.get(key), "shape", "missing")
     if shape != (rows, width) and (shape, width) != ((rows,), 1):
         sys.exit(f"{file.filename}: '{key}' is {shape}, where {(rows, width)} was expected")
     column = file[key][:].astype(np.float32, copy=False).reshape(rows, width)
@@ -255,29 +255,26 @@ def parse_args(argv=None):
     return args
 
 
-def write(path, content):
-    """Writes bytes to a file, whole or not at all."""
-    Path(f"{path}.part").write_bytes(content)
-    os.replace(f"{path}.part", path)
-
-
 def save_checkpoint(run_dir, checkpoint):
-    """Writes evaluations.csv, from the checkpoint's rows, and checkpoint.pt; the one before it becomes previous.pt."""
+    """Writes checkpoint.pt, args.json and evaluations.csv, all or none; the last checkpoint becomes previous.pt."""
     table, content = io.StringIO(), io.BytesIO()
     writer = csv.DictWriter(table, checkpoint["rows"][-1], lineterminator="\n")
     writer.writeheader()
     writer.writerows(checkpoint["rows"])
-    write(run_dir / "evaluations.csv", table.getvalue().encode())
     torch.save(checkpoint, content)  # to memory: to a full disk it would raise no OSError
-    write(run_dir / "next.pt", content.getvalue())
+    files = {"args.json": json.dumps(checkpoint["args"], indent=2).encode(), "evaluations.csv": table.getvalue().encode()}
+    files["checkpoint.pt"] = content.getvalue()
+    for name, content in files.items():
+        (run_dir / f"{name}.part").write_bytes(content)
     if (run_dir / "checkpoint.pt").exists():
         os.replace(run_dir / "checkpoint.pt", run_dir / "previous.pt")
-    os.replace(run_dir / "next.pt", run_dir / "checkpoint.pt")
+    for name in files:
+        os.replace(run_dir / f"{name}.part", run_dir / name)
 
 
 def load_checkpoint(run_dir):
     """A folder's last checkpoint, on the CPU, or None. Runs nothing in it; exits with a sentence if it is damaged."""
-    for path in (Path(run_dir, "checkpoint.pt"), Path(run_dir, "previous.pt")):  # the first lacks for a moment in saving
+    for path in (Path(run_dir, "checkpoint.pt"), Path(run_dir, "previous.pt")):  # the second alone: stopped in saving
         try:
             if path.exists() and zipfile.ZipFile(path).testzip() is None:  # the CRCs, which torch.load does not check
                 return torch.load(path, map_location="cpu", weights_only=True)
@@ -313,7 +310,6 @@ def train(args):
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends, however it does
     except BlockingIOError:
         sys.exit(f"{run_dir} is in use by another process")
-    write(run_dir / "args.json", json.dumps(asdict(args), indent=2).encode())
     rng = torch.Generator(device).manual_seed(args.seed)  # of batches and noise, whatever the networks drew
     start, rows, history = 0, [], defaultdict(list)  # history: the metrics of each step since they were logged
     if checkpoint := load_checkpoint(run_dir):
@@ -392,6 +388,7 @@ def train(args):
 
 if __name__ == "__main__":
     sys.stdout.reconfigure(line_buffering=True)  # a log file is up to date, however the run ends
+    threading.excepthook = lambda _: None  # TensorBoard's writer: its error comes up again in flush()
     try:
         train(parse_args())
     except KeyboardInterrupt:
