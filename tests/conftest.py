@@ -9,10 +9,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import torch
 
 ROOT = Path(__file__).parents[1]
 DATASET = ROOT / "tests/data/halfcheetah_replay.hdf5"
 sys.path.insert(0, str(ROOT))  # the scripts are no package
+torch.set_num_threads(1)  # enough for networks this small, whatever else runs
 
 import td3_bc  # noqa: E402
 import wbc  # noqa: E402

@@ -60,7 +60,7 @@ class List:
     max_timesteps: int = 1_000_000
     runs: Path = Path("runs")  # folder of the run folders, <system>__<task>__<seed>
     datasets: Path | None = None  # folder of <task>.hdf5 files to use for D4RL's, such as halfcheetah_medium.hdf5
-    extra: str = ""  # further arguments of every command, such as "--eval-freq 10000"
+    extra: str = ""  # further arguments of every command, such as --extra="--eval-freq 10000"
 
 
 @dataclass
@@ -79,7 +79,7 @@ def list_commands(args):
         for system in args.systems or systems:
             for seed in args.seeds:
                 script, _, weight = system.partition("-")
-                line = f"{sys.executable} {script}.py --env {task} --seed {seed} --max-timesteps {args.max_timesteps}"
+                line = f"OMP_NUM_THREADS=1 {sys.executable} {script}.py --env {task} --seed {seed} --max-timesteps {args.max_timesteps}"
                 if args.datasets:
                     line += f" --dataset {args.datasets}/{task.removesuffix('-v2').replace('-', '_')}.hdf5"
                 line += f" --weight {weight}" if weight else ""

@@ -27,6 +27,7 @@ def make(name, options):
         for name in ("actor_target", "critic_target"):
             for p in networks[name].parameters():
                 p.add_(0.05 * torch.randn(p.shape, generator=rng))
+        networks["actor_target"].net[4].weight *= 30  # saturated: noise leads beyond the largest action
         for q in networks["critic"]:
             q[4].bias -= 0.5
     rng = torch.Generator().manual_seed(2)
