@@ -46,7 +46,8 @@ LABELS = {
     "wpc-static": "static weight",
 }
 # Colours that the colour-blind tell apart (Okabe and Ito, 2008), and line styles for print
-STYLES = dict(zip(LABELS, [("#0072B2", "-"), ("#E69F00", "--"), ("#009E73", "-."), ("#CC79A7", "--"), ("#56B4E9", ":"), ("#D55E00", "--")]))
+COLORS, LINES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"), ("-", "--", "-.", "--", ":", "-.")
+STYLES = dict(zip(LABELS, zip(COLORS, LINES)))
 
 
 @dataclass
@@ -169,13 +170,16 @@ def report(args):
     found = {task for _, task in runs}
     tasks = [task for task in TASKS if task in found] + sorted(found - set(TASKS))
     steps = sorted({int(c["step"][-1]) for seeds in runs.values() for c in seeds.values()})
-    datasets = {json.loads(p.read_text())["dataset"] for p in args.runs.glob("*__*__*/args.json")}
-    source = "D4RL's own files" if datasets == {None} else "datasets of one's own, not D4RL's: " + ", ".join(sorted(Path(d).name for d in datasets if d))
-    text = [f"Normalized scores: mean ± sample standard deviation (ddof = 1) over seeds, after {', '.join(f'{s:,}' for s in steps)} steps, on {source}. The paper's values: 5 seeds, 1,000,000 steps, D4RL.\n"]
+    datasets = sorted({json.loads(p.read_text())["dataset"] or "" for p in args.runs.glob("*__*__*/args.json")})
+    source = "D4RL's own files" if datasets == [""] else f"datasets other than D4RL's: {', '.join(Path(d).name for d in datasets)}"
+    text = [
+        f"Normalized scores, mean ± sample standard deviation (ddof = 1) over seeds, at the end of {' or '.join(f'{s:,}' for s in steps)} "
+        f"training steps on {source}. The paper's values: 5 seeds, 1,000,000 steps, D4RL's files.\n"
+    ]
     for title, experiment in (("Table 1", "table1"), ("Table 2", "table2"), ("Figure 4", "figure4")):
-        systems = EXPERIMENTS[experiment][0]
-        shown = [t for t in tasks if any((s, t) in runs for s in systems)]
-        text += [f"## {title}\n", table(runs, systems, shown)]
+        systems, own = EXPERIMENTS[experiment]
+        shown = [t for t in tasks if any((s, t) in runs for s in systems) and (t in own or experiment != "figure4")]
+        text += [f"## {title}\n", table(runs, systems, shown)] if shown else []
     (args.out / "tables.md").write_text("\n".join(text))
     figure(args.out / "figure2.png", runs, EXPERIMENTS["table1"][0], tasks, ["score"])
     figure(args.out / "figure3.png", runs, EXPERIMENTS["table1"][0], tasks, ["q"])
