@@ -196,8 +196,7 @@ def minimize(loss, optimizer):
 def update(networks, optimizers, batch, args, step, rng):
     """Step number `step`, from 1 on, of Algorithm 1.
 
-    `batch` holds the columns of `load_dataset`, each (B, width). Returns metrics, 0-dim tensors by name: those of the
-    policy only where it moves.
+    `batch`: the columns of `load_dataset`, each (B, width). Returns the metrics, 0-dim tensors by name.
     """
     actor, critic, actor_target, critic_target, *_ = networks.values()
     s, a, r, not_done, s_next = batch
@@ -234,13 +233,13 @@ def parse_args(argv=None):
     """The arguments, checked; where --run-dir holds a run, those not given are its own."""
     args = tyro.cli(Args, args=argv, description=__doc__)
     if checkpoint := load_checkpoint(args.run_dir) if args.run_dir else None:
-        if checkpoint["script"] != SCRIPT:
-            sys.exit(f"{args.run_dir} holds a run of {checkpoint['script']}.py: choose another --run-dir")
+        if checkpoint.get("script") != SCRIPT:
+            sys.exit(f"{args.run_dir} holds no run of {SCRIPT}.py but another's: choose another --run-dir")
         saved = checkpoint["args"] | {"run_dir": args.run_dir, "eval_only": args.eval_only}
         args = tyro.cli(Args, args=argv, default=Args(**saved))
         for name in () if args.eval_only else saved.keys() - {"max_timesteps", "device", "dataset"}:
             if getattr(args, name) != saved[name]:
-                sys.exit(f"the run in {args.run_dir} has {name} {saved[name]}: leave it so, or choose another --run-dir")
+                sys.exit(f"the run in {args.run_dir} has {name} {saved[name]}: keep that, or choose another --run-dir")
     elif args.eval_only:
         sys.exit("--eval-only needs a --run-dir with a checkpoint")
     tasks = [f"{robot}-{kind}-v2" for robot in ROBOTS for kind in KINDS]
@@ -258,12 +257,13 @@ def parse_args(argv=None):
 def save_checkpoint(run_dir, checkpoint):
     """Writes checkpoint.pt, args.json and evaluations.csv, all or none; the last checkpoint becomes previous.pt."""
     table, content = io.StringIO(), io.BytesIO()
-    writer = csv.DictWriter(table, checkpoint["rows"][-1], lineterminator="\n")
+    columns = dict.fromkeys(column for row in checkpoint["rows"] for column in row)
+    writer = csv.DictWriter(table, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(checkpoint["rows"])
     torch.save(checkpoint, content)  # to memory: to a full disk it would raise no OSError
-    files = {"args.json": json.dumps(checkpoint["args"], indent=2).encode(), "evaluations.csv": table.getvalue().encode()}
-    files["checkpoint.pt"] = content.getvalue()
+    files = {"args.json": json.dumps(checkpoint["args"], indent=2).encode()}
+    files |= {"evaluations.csv": table.getvalue().encode(), "checkpoint.pt": content.getvalue()}
     for name, content in files.items():
         (run_dir / f"{name}.part").write_bytes(content)
     if (run_dir / "checkpoint.pt").exists():
@@ -281,7 +281,7 @@ def load_checkpoint(run_dir):
         except Exception:
             pass
         if path.exists():
-            sys.exit(f"{path} is damaged: delete it to go on from the checkpoint before it, previous.pt, if there is one")
+            sys.exit(f"{path} is damaged: delete it to go on from the checkpoint before it, previous.pt, if it is there")
 
 
 def train(args):
@@ -346,18 +346,16 @@ def train(args):
             if history and (due or step % args.log_freq == 0):
                 metrics = {name: torch.stack(values).mean().item() for name, values in history.items()}
                 history.clear()
-                metrics["best_discounted_return"] = best_return
-                metrics["steps_per_second"] = (step - clock_step) / (time.perf_counter() - clock)
+                speed = (step - clock_step) / (time.perf_counter() - clock)
+                metrics |= {"best_discounted_return": best_return, "steps_per_second": speed}
                 clock, clock_step = time.perf_counter(), step
                 for name, metric in metrics.items():
                     writer.add_scalar(f"train/{name}", metric, step)
-                progress.set_postfix({name: f"{metrics[name]:.3g}" for name in ("q", "weight") if name in metrics})
+                shown = {"score": rows[-1]["score"]} | metrics
+                progress.set_postfix({name: f"{shown[name]:.3g}" for name in ("score", "q", "weight") if name in shown})
                 if metrics["target_q"] > 2 * abs(best_return) and not warned:
                     warned = True
-                    progress.write(
-                        f"step {step:,}: Q is over twice the best discounted return in the data, "
-                        "so the constraint may be too weak for this data: consider a smaller --alpha"
-                    )
+                    progress.write(f"step {step:,}: Q is over twice the data's best discounted return: try a smaller --alpha")
             if due or stopped or step % args.log_freq == 0:
                 sums = {name: sum(x.detach().sum() for x in network.parameters()) for name, network in networks.items()}
                 if bad := [name for name, value in (metrics | sums).items() if not np.isfinite(float(value))]:
@@ -382,8 +380,8 @@ def train(args):
                 progress.write(f"stopped at step {step:,}; to go on: python {SCRIPT}.py --run-dir {run_dir}")
                 sys.exit(128 + stopped[0])
     last = [row["score"] for row in rows[-10:]]
-    print(f"finished step {rows[-1]['step']:,}: score {last[-1]:.2f}, mean of the last {len(last)}: {np.mean(last):.2f}")
-    print(f"files    {run_dir}/: evaluations.csv, checkpoint.pt, args.json and TensorBoard's events")
+    print(f"finished step {rows[-1]['step']:,}: score {last[-1]:.2f}, mean of the last {len(last)} {np.mean(last):.2f}")
+    print(f"in {run_dir}/: evaluations.csv, checkpoint.pt, args.json, TensorBoard's events")
 
 
 if __name__ == "__main__":
