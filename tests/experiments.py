@@ -89,27 +89,29 @@ def list_commands(args):
 
 
 def read_runs(folder):
-    """{(system, task): {seed: {column: array over evaluations}}} of all run folders that hold a table."""
-    runs = {}
+    """{(system, task): {seed: {column: array over evaluations}}} of all run folders, and {task: what to call it}."""
+    runs, names = {}, {}
     for path in sorted(folder.glob("*__*__*/evaluations.csv")):
         system, task, seed = path.parent.name.split("__")
         rows = list(csv.DictReader(path.open()))
         columns = {key: np.array([float(row[key] or "nan") for row in rows]) for key in rows[0] if key != "returns"}
         runs.setdefault((system, task), {})[int(seed)] = columns
-    return runs
+        own = json.loads((path.parent / "args.json").read_text())["dataset"]
+        names[task] = f"{task.removesuffix('-v2')} (not D4RL's file)" if own else task
+    return runs, names
 
 
 def cell(values):
     return f"{np.mean(values):.1f}" + (f" ± {np.std(values, ddof=1):.1f}" if len(values) > 1 else "")
 
 
-def table(runs, systems, tasks):
+def table(runs, names, systems, tasks):
     """A Markdown table: for each system the last evaluation, the mean of the last ten, seeds and the paper's value."""
     lines = ["| task | " + " | ".join(f"{LABELS[s]}: last | last ten | seeds | paper" for s in systems) + " |"]
     lines.append("|" + "---|" * (1 + 4 * len(systems)))
     sums = {}
     for task in tasks:
-        cells = [task]
+        cells = [names[task]]
         for system in systems:
             seeds = runs.get((system, task), {}).values()
             paper = PAPER[system][TASKS.index(task)] if system in PAPER and task in TASKS else None
@@ -141,20 +143,20 @@ def panel(axis, runs, systems, task, column):
     axis.grid(alpha=0.3)
 
 
-def figure(path, runs, systems, tasks, columns):
+def figure(path, runs, names, systems, tasks, columns):
     """One panel a task and column; nothing where no two of the systems have run on one of the tasks."""
     tasks = [t for t in tasks if sum((s, t) in runs for s in systems) > 1]
     if not tasks:
         return
-    names = {"score": "normalized score", "q": "Q1(s, a), mean over the batch"}
+    labels = {"score": "normalized score", "q": "Q1(s, a), mean over the batch"}
     panels = [(task, column) for task in tasks for column in columns]
     width = min(len(panels), 3)
     height = -(-len(panels) // width)
     fig, axes = plt.subplots(height, width, figsize=(4.2 * width, 3.2 * height), squeeze=False, layout="constrained")
     for axis, (task, column) in zip(axes.flat, panels):
         panel(axis, runs, systems, task, column)
-        axis.set_title(task)
-        axis.set_ylabel(names[column])
+        axis.set_title(names[task], fontsize="medium")
+        axis.set_ylabel(labels[column])
         axis.legend(title="system (seeds)", fontsize="small", title_fontsize="small")
     for axis in axes.flat[len(panels) :]:
         axis.remove()
@@ -163,28 +165,25 @@ def figure(path, runs, systems, tasks, columns):
 
 
 def report(args):
-    runs = read_runs(args.runs)
+    runs, names = read_runs(args.runs)
     if not runs:
         sys.exit(f"{args.runs} holds no run folders named <system>__<task>__<seed>: run what `list` prints")
     args.out.mkdir(parents=True, exist_ok=True)
-    found = {task for _, task in runs}
-    tasks = [task for task in TASKS if task in found] + sorted(found - set(TASKS))
+    tasks = [task for task in TASKS if task in names] + sorted(names.keys() - set(TASKS))
     steps = sorted({int(c["step"][-1]) for seeds in runs.values() for c in seeds.values()})
-    datasets = sorted({json.loads(p.read_text())["dataset"] or "" for p in args.runs.glob("*__*__*/args.json")})
-    source = "D4RL's own files" if datasets == [""] else f"datasets other than D4RL's: {', '.join(Path(d).name for d in datasets)}"
     text = [
-        f"Normalized scores, mean ± sample standard deviation (ddof = 1) over seeds, at the end of {' or '.join(f'{s:,}' for s in steps)} "
-        f"training steps on {source}. The paper's values: 5 seeds, 1,000,000 steps, D4RL's files.\n"
+        "Normalized scores, mean ± sample standard deviation (ddof = 1) over seeds, at the end of "
+        f"{' or '.join(f'{s:,}' for s in steps)} training steps. The paper's values: 5 seeds, 1,000,000 steps, D4RL's files.\n"
     ]
     for title, experiment in (("Table 1", "table1"), ("Table 2", "table2"), ("Figure 4", "figure4")):
         systems, own = EXPERIMENTS[experiment]
         shown = [t for t in tasks if any((s, t) in runs for s in systems) and (t in own or experiment != "figure4")]
-        text += [f"## {title}\n", table(runs, systems, shown)] if shown else []
+        text += [f"## {title}\n", table(runs, names, systems, shown)] if shown else []
     (args.out / "tables.md").write_text("\n".join(text))
-    figure(args.out / "figure2.png", runs, EXPERIMENTS["table1"][0], tasks, ["score"])
-    figure(args.out / "figure3.png", runs, EXPERIMENTS["table1"][0], tasks, ["q"])
-    figure(args.out / "figure4.png", runs, EXPERIMENTS["figure4"][0], EXPERIMENTS["figure4"][1], ["q", "score"])
-    figure(args.out / "figure5.png", runs, EXPERIMENTS["table2"][0], tasks, ["score"])
+    figure(args.out / "figure2.png", runs, names, EXPERIMENTS["table1"][0], tasks, ["score"])
+    figure(args.out / "figure3.png", runs, names, EXPERIMENTS["table1"][0], tasks, ["q"])
+    figure(args.out / "figure4.png", runs, names, EXPERIMENTS["figure4"][0], EXPERIMENTS["figure4"][1], ["q", "score"])
+    figure(args.out / "figure5.png", runs, names, EXPERIMENTS["table2"][0], tasks, ["score"])
     print("\n".join(text) + f"\nwritten to {args.out}/")
 
 
