@@ -46,7 +46,7 @@ LABELS = {
     "wpc-static": "static weight",
 }
 # Colours that the colour-blind tell apart (Okabe and Ito, 2008), and line styles for print
-COLORS, LINES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"), ("-", "--", "-.", "--", ":", "-.")
+COLORS, LINES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"), ("-", "--", "-.", (0, (6, 1, 1, 1, 1, 1)), ":", (0, (8, 2)))
 STYLES = dict(zip(LABELS, zip(COLORS, LINES)))
 
 
@@ -135,10 +135,12 @@ def panel(axis, runs, systems, task, column):
             length = min(len(c["step"]) for c in seeds)
             steps, values = seeds[0]["step"][:length] / 1000, np.stack([c[column][:length] for c in seeds])
             mean, (color, line) = values.mean(0), STYLES[system]
-            axis.plot(steps, mean, line, color=color, label=f"{LABELS[system]} ({len(seeds)})")
+            axis.plot(steps, mean, linestyle=line, color=color, label=f"{LABELS[system]} ({len(seeds)})")
             if len(seeds) > 1:
                 spread = values.std(0, ddof=1)
                 axis.fill_between(steps, mean - spread, mean + spread, color=color, alpha=0.2, linewidth=0)
+            if column == "q" and np.nanmax(mean) > 10_000:  # Q runs away
+                axis.set_yscale("log")
     axis.set_xlabel("training steps (thousands)")
     axis.grid(alpha=0.3)
 
