@@ -235,6 +235,10 @@ class Server(http.server.ThreadingHTTPServer):
         threading.Thread(target=self.serve_forever, daemon=True).start()
         self.url = f"http://127.0.0.1:{self.server_address[1]}/"
 
+    def server_close(self):
+        self.shutdown()  # or its thread would spin on the closed socket
+        super().server_close()
+
 
 CONTENT = np.random.default_rng(0).bytes(300_000)
 
