@@ -6,8 +6,7 @@ The policy imitates the dataset's actions, but only those that are better than a
     pi = argmin E[ w(s, a) * (pi(s) - a)^2 ],  w(s, a) = 1 if Q(s, a) > V(s) else 0
 """
 
-import copy, csv, fcntl, hashlib, io, json, os, signal, socket, sys, threading, time, zipfile
-from collections import defaultdict
+import contextlib, copy, csv, fcntl, hashlib, io, json, os, signal, socket, sys, threading, time, warnings, zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -34,10 +33,8 @@ SHA256 = {  # the first 16 digits for D4RL's file of each kind
     "hopper": "63103ef7059db4c0 5bdf1bc4a713c829 e121c5f7c9857a30 56baf95963c51c1e 9d51ad87f8c905be 01aa219a5f8eea5e",
     "walker2d": "4e863bb6090cf4a4 cf00f43add04c17f e75de96a4f77acf7 f2720f9d27b2acef 6b8d7f868c45bbae 2985dc3d436a8baa",
 }
-SERVERS = (  # D4RL's own, often down, and a mirror of it
-    "http://rail.eecs.berkeley.edu/datasets/offline_rl/gym_mujoco_v2/",
-    "https://huggingface.co/datasets/imone/D4RL/resolve/main/",
-)
+SERVER = "http://rail.eecs.berkeley.edu/datasets/offline_rl/gym_mujoco_v2/"  # D4RL's own, often down
+MIRROR = "https://huggingface.co/datasets/imone/D4RL/resolve/main/"
 
 
 @dataclass
@@ -51,17 +48,17 @@ class Args:
     batch_size: int = 256  # transitions of a training step
     discount: float = 0.99  # gamma
     tau: float = 0.005  # rate at which the target networks follow
-    policy_noise: float = 0.2  # sigma of the noise on the target's action, in units of the largest action
-    noise_clip: float = 0.5  # bound c of that noise, in the same units
+    policy_noise: float = 0.2  # sigma of the noise on the target's action
+    noise_clip: float = 0.5  # bound c of that noise
     policy_freq: int = 2  # training steps from one update of the policy, and of all targets, to the next
     policy_lr: float = 3e-4  # learning rate of the policy
     q_lr: float = 3e-4  # learning rate of the critics
     v_lr: float = 3e-4  # learning rate of V
     normalize: bool = True  # shift and scale the observations to mean 0 and standard deviation 1 over the dataset
     device: Literal["auto", "cpu", "cuda"] = "auto"  # where to train; auto takes a GPU if there is one
+    cudagraphs: bool = False  # on a GPU: launch each training step as one CUDA graph; no GPU has run this yet
     log_freq: int = 1_000  # training steps from one entry in TensorBoard, a mean over them, to the next
     run_dir: str | None = None  # folder of the run, begun or continued; by default a new one under runs/
-    eval_only: bool = False  # evaluate the policy of --run-dir and leave all as it is
 
 
 def mlp(inputs, outputs):
@@ -69,27 +66,17 @@ def mlp(inputs, outputs):
     return nn.Sequential(nn.Linear(inputs, 256), relu, nn.Linear(256, 256), relu, nn.Linear(256, outputs))
 
 
-class Actor(nn.Module):
-    """The policy pi: normalized observations (batch, obs_dim) -> actions (batch, action_dim) within +-max_action."""
-
-    def __init__(self, obs_dim, action_dim, max_action):
-        super().__init__()
-        self.net, self.max_action = mlp(obs_dim, action_dim), max_action
-
-    def forward(self, s):
-        return self.max_action * torch.tanh(self.net(s))
-
-
-def make_networks(obs_dim, action_dim, max_action, args, device):
+def make_networks(obs_dim, action_dim, args, device):
     """The networks of Table 4 and the optimizers of those that learn: two dicts by name, fixed by `args.seed`."""
     torch.manual_seed(args.seed)
     critic = nn.ModuleList(mlp(obs_dim + action_dim, 1) for _ in range(2))  # Q1 and Q2
-    networks = {"actor": Actor(obs_dim, action_dim, max_action), "critic": critic}
+    actor = mlp(obs_dim, action_dim).append(nn.Tanh())  # pi: normalized s -> a within +-1, each robot's limits
+    networks = {"actor": actor, "critic": critic}
     networks |= {f"{name}_target": copy.deepcopy(network).requires_grad_(False) for name, network in networks.items()}
     networks["value"] = mlp(obs_dim, 1)  # V, made last: actor and critics start as they do in td3_bc.py
     networks = {name: network.to(device) for name, network in networks.items()}
-    rates = {"actor": args.policy_lr, "critic": args.q_lr}
-    optimizers = {name: torch.optim.Adam(networks[name].parameters(), lr, fused=True) for name, lr in rates.items()}
+    optimizers = {"actor": torch.optim.Adam(actor.parameters(), args.policy_lr, fused=True, capturable=True)}
+    optimizers["critic"] = torch.optim.Adam(critic.parameters(), args.q_lr, fused=True, capturable=True)
     optimizers["critic"].add_param_group({"params": list(networks["value"].parameters()), "lr": args.v_lr})
     return networks, optimizers
 
@@ -100,7 +87,7 @@ def dataset_path(args):
     folder = Path(os.environ.get("D4RL_DATASET_DIR") or Path.home() / ".d4rl/datasets")
     path = Path(args.dataset or folder / f"{robot}_{kind.replace('-', '_')}-v2.hdf5")
     problems = []
-    for server in () if args.dataset or path.exists() else SERVERS:
+    for server in () if args.dataset or path.exists() else (SERVER, MIRROR):
         try:  # into a temporary file, moved to its place when it is complete and right
             folder.mkdir(parents=True, exist_ok=True)
             socket.setdefaulttimeout(30)  # seconds that a server may be silent
@@ -138,9 +125,8 @@ def load_dataset(path, obs_dim, action_dim, args):
     o[i+1] belongs to the next episode, and so is the last row. Without `timeouts`, an episode ends after 1000 steps.
 
     Returns transitions, float32 (N, sum(widths)), whose columns are s, a, r, not_done, s_next;
-    mean and std, float32 (obs_dim,), that normalize s and s_next; widths; returns, float64 (episodes,), and the best
-    discounted one.
-    Exits with a sentence if the file is no HDF5, damaged, incomplete, empty, not finite or of other dimensions.
+    then mean and std, float32 (obs_dim,), that normalize s and s_next; widths; returns, float64 (episodes,), and the
+    best discounted one. Exits with a sentence if the file is no HDF5, damaged, incomplete, empty or does not fit.
     """
     try:
         with h5py.File(path) as file:
@@ -157,7 +143,6 @@ def load_dataset(path, obs_dim, action_dim, args):
     keep = np.flatnonzero(~timeout[:-1])
     if len(keep) == 0:
         sys.exit(f"{path} has no transitions, only {rows} rows")
-
     episode, t = episode_steps(terminal | timeout)
     returns = np.bincount(episode, rewards[:, 0])
     best_return = np.bincount(episode, rewards[:, 0] * args.discount**t).max()
@@ -196,18 +181,14 @@ def minimize(loss, optimizer):
 
 
 def update(networks, optimizers, batch, args, step, rng):
-    """Step number `step`, from 1 on, of Algorithm 1.
-
-    `batch`: the columns of `load_dataset`, each (B, width). Returns the metrics, 0-dim tensors by name.
-    """
+    """Step `step` (from 1 on) of Algorithm 1, on columns (B, width) of `load_dataset`; returns its metrics by name."""
     actor, critic, actor_target, critic_target, *_ = networks.values()
     value = networks["value"]
     s, a, r, not_done, s_next = batch
 
     with torch.no_grad():
         noise = args.policy_noise * torch.randn(a.shape, generator=rng, device=a.device)
-        noise = actor.max_action * noise.clamp(-args.noise_clip, args.noise_clip)
-        a_next = (actor_target(s_next) + noise).clamp(-actor.max_action, actor.max_action)
+        a_next = (actor_target(s_next) + noise.clamp(-args.noise_clip, args.noise_clip)).clamp(-1, 1)
         sa_next = torch.cat([s_next, a_next], 1)
         y = r + args.discount * not_done * torch.minimum(*(q(sa_next) for q in critic_target))
 
@@ -242,18 +223,16 @@ def parse_args(argv=None):
     if checkpoint := load_checkpoint(args.run_dir) if args.run_dir else None:
         if checkpoint.get("script") != SCRIPT:
             sys.exit(f"{args.run_dir} holds no run of {SCRIPT}.py but another's: choose another --run-dir")
-        saved = checkpoint["args"] | {"run_dir": args.run_dir, "eval_only": args.eval_only}
+        saved = checkpoint["args"] | {"run_dir": args.run_dir}
         args = tyro.cli(Args, args=argv, default=Args(**saved))
-        for name in () if args.eval_only else saved.keys() - {"max_timesteps", "device", "dataset"}:
+        for name in saved.keys() - {"max_timesteps", "device", "cudagraphs", "dataset"}:
             if getattr(args, name) != saved[name]:
                 sys.exit(f"the run in {args.run_dir} has {name} {saved[name]}: keep that, or choose another --run-dir")
-    elif args.eval_only:
-        sys.exit("--eval-only needs a --run-dir with a checkpoint")
     tasks = [f"{robot}-{kind}-v2" for robot in ROBOTS for kind in KINDS]
     if args.env not in tasks and not (args.dataset and args.env in ROBOTS):
         sys.exit(f"--env {args.env} is none of {', '.join(tasks)}; with --dataset also {', '.join(ROBOTS)}")
-    if args.device == "cuda" and not torch.cuda.is_available():
-        sys.exit("--device cuda finds no GPU: use --device cpu")
+    if (args.device == "cuda" or args.cudagraphs) and (args.device == "cpu" or not torch.cuda.is_available()):
+        sys.exit("--device cuda and --cudagraphs need a GPU: leave them out")
     for name, value in asdict(args).items():
         low, high = (0, 1) if name in ("discount", "tau") else (0 if type(value) is float or name == "seed" else 1, 1e9)
         if type(value) in (int, float) and not low <= value <= high:
@@ -282,30 +261,21 @@ def save_checkpoint(run_dir, checkpoint):
 def load_checkpoint(run_dir):
     """A folder's last checkpoint, on the CPU, or None. Runs nothing in it; exits with a sentence if it is damaged."""
     for path in (Path(run_dir, "checkpoint.pt"), Path(run_dir, "previous.pt")):  # the second alone: stopped in saving
-        try:
-            if path.exists() and zipfile.ZipFile(path).testzip() is None:  # the CRCs, which torch.load does not check
-                return torch.load(path, map_location="cpu", weights_only=True)
-        except Exception:
-            pass
         if path.exists():
+            with contextlib.suppress(Exception):
+                if zipfile.ZipFile(path).testzip() is None:  # the CRCs, which torch.load does not check
+                    return torch.load(path, map_location="cpu", weights_only=True)
             sys.exit(f"{path} is damaged: delete it to go on from the checkpoint before it, previous.pt, if it is there")
 
 
 def train(args):
     """Runs Algorithm 1 with evaluations, logs and checkpoints, from the start or from where --run-dir stopped."""
-    gym.logger.min_level = gym.logger.ERROR  # no advice to leave -v4
+    warnings.filterwarnings("ignore", ".*(out of date|capturable)")  # Gymnasium's on -v4, Adam's outside of CUDA graphs
     env_id, low, high = ROBOTS[args.env.split("-")[0]]
     envs = gym.make_vec(env_id, args.eval_episodes, vectorization_mode="sync")
     obs_dim, action_dim = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
     device = torch.device("cuda" if args.device != "cpu" and torch.cuda.is_available() else "cpu")
-    networks, optimizers = make_networks(obs_dim, action_dim, float(envs.single_action_space.high[0]), args, device)
-    if args.eval_only:
-        checkpoint = load_checkpoint(args.run_dir)
-        networks["actor"].load_state_dict(checkpoint["networks"]["actor"])
-        returns = evaluate(envs, networks["actor"], checkpoint["mean"], checkpoint["std"], args.seed)
-        scores = 100 * (returns - low) / (high - low)
-        return print(f"step {checkpoint['step']:,}  score {scores.mean():.2f} +- {scores.std():.2f}")
-
+    networks, optimizers = make_networks(obs_dim, action_dim, args, device)
     path = dataset_path(args)
     transitions, mean, std, widths, returns, best_return = load_dataset(path, obs_dim, action_dim, args)
     sha256 = hashlib.sha256(transitions.numpy()).hexdigest()
@@ -318,7 +288,7 @@ def train(args):
     except BlockingIOError:
         sys.exit(f"{run_dir} is in use by another process")
     rng = torch.Generator(device).manual_seed(args.seed)  # of batches and noise, whatever the networks drew
-    start, rows, history = 0, [], defaultdict(list)  # history: the metrics of each step since they were logged
+    start, rows, history = 0, [], {}  # history: the metrics of each step since they were logged
     if checkpoint := load_checkpoint(run_dir):
         if checkpoint["sha256"] != sha256:
             sys.exit(f"the run in {run_dir} is on other data than {path}: choose another --run-dir")
@@ -326,8 +296,7 @@ def train(args):
         for kind, parts in (("networks", networks), ("optimizers", optimizers)):
             for name, part in parts.items():
                 part.load_state_dict(checkpoint[kind][name])
-        for name, values in checkpoint["history"].items():
-            history[name] += values.to(device)
+        history = {name: list(values.to(device)) for name, values in checkpoint["history"].items()}
         if checkpoint["device"] == device.type:  # else the state does not fit
             rng.set_state(checkpoint["rng"])
 
@@ -339,15 +308,27 @@ def train(args):
     transitions, stopped = transitions.to(device), []
     for number in (signal.SIGINT, signal.SIGTERM):  # heard between two steps; a second one acts at once
         signal.signal(number, lambda number, _: (stopped.append(number), signal.signal(number, signal.SIG_DFL)))
-    metrics, warned, clock, clock_step = {}, False, time.perf_counter(), start
+
+    def train_step(step):
+        i = torch.randint(len(transitions), (args.batch_size,), generator=rng, device=device)
+        return update(networks, optimizers, transitions[i].split(widths, dim=1), args, step, rng)
+    graphs, results, metrics, warned, clock, clock_step = {}, {}, {}, False, time.perf_counter(), start
     writer = SummaryWriter(run_dir, purge_step=start + 1 if checkpoint else 0)
     with writer, tqdm(desc=SCRIPT, initial=start, total=args.max_timesteps, unit="step", disable=None) as progress:
         for step in range(start, args.max_timesteps + 1):
             if step > start:
-                i = torch.randint(len(transitions), (args.batch_size,), generator=rng, device=device)
-                batch = transitions[i].split(widths, dim=1)
-                for name, metric in update(networks, optimizers, batch, args, step, rng).items():
-                    history[name].append(metric)
+                kind = step % args.policy_freq == 0  # with the policy's update or without it
+                if args.cudagraphs and kind not in graphs and step > start + 2 * args.policy_freq:  # Adam is set up
+                    graphs[kind] = torch.cuda.CUDAGraph()
+                    graphs[kind].register_generator_state(rng)
+                    with torch.cuda.graph(graphs[kind]):  # records the step and runs nothing
+                        results[kind] = train_step(step)
+                if kind in graphs:
+                    graphs[kind].replay()
+                else:
+                    results[kind] = train_step(step)
+                for name, metric in results[kind].items():
+                    history.setdefault(name, []).append(metric.clone())  # the next replay overwrites it
                 progress.update()
             due = (step % args.eval_freq == 0 or step == args.max_timesteps) and (not rows or rows[-1]["step"] < step)
             if history and (due or step % args.log_freq == 0):
@@ -388,7 +369,7 @@ def train(args):
                 sys.exit(128 + stopped[0])
     last = [row["score"] for row in rows[-10:]]
     print(f"finished step {rows[-1]['step']:,}: score {last[-1]:.2f}, mean of the last {len(last)} {np.mean(last):.2f}")
-    print(f"in {run_dir}/: evaluations.csv, checkpoint.pt, args.json, TensorBoard's events")
+    print(f"files    {run_dir}/: evaluations.csv, checkpoint.pt, args.json, TensorBoard's events")
 
 
 if __name__ == "__main__":

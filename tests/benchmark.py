@@ -43,7 +43,7 @@ def script_steps(script, obs_dim, action_dim):
     """The real update of a script, with the sampling of `train`."""
     args = script.Args()
     args.alpha = 2.5
-    networks, optimizers = script.make_networks(obs_dim, action_dim, 1.0, args, "cpu")
+    networks, optimizers = script.make_networks(obs_dim, action_dim, args, "cpu")
     widths = [obs_dim, action_dim, 1, 1, obs_dim, 1][: 6 if script is wpc else 5]
     transitions, rng = torch.randn(ROWS, sum(widths)), torch.Generator().manual_seed(0)
 
@@ -56,7 +56,7 @@ def script_steps(script, obs_dim, action_dim):
 
 def textbook_steps(obs_dim, action_dim):
     """wPC as one would first write it: NumPy buffers, a FloatTensor for each array, three Adams, a loop for the targets."""
-    actor, actor_target = (wpc.Actor(obs_dim, action_dim, 1.0) for _ in range(2))
+    actor, actor_target = (wpc.mlp(obs_dim, action_dim).append(nn.Tanh()) for _ in range(2))
     q1, q2, q1_target, q2_target = (wpc.mlp(obs_dim + action_dim, 1) for _ in range(4))
     value = wpc.mlp(obs_dim, 1)
     critics = nn.ModuleList([q1, q2])
@@ -160,7 +160,8 @@ def benchmark_evaluation(results):
         envs = gym.make_vec(wpc.ROBOTS[robot.lower()][0], 10, vectorization_mode="sync")
         for env in envs.envs:  # full-length episodes, whatever the policy
             env.unwrapped._terminate_when_unhealthy = False
-        actor, mean, std = wpc.Actor(obs_dim, action_dim, 1.0), torch.zeros(obs_dim), torch.ones(obs_dim)
+        actor = wpc.make_networks(obs_dim, action_dim, wpc.Args(), "cpu")[0]["actor"]
+        mean, std = torch.zeros(obs_dim), torch.ones(obs_dim)
         times = []
         for seed in range(3):
             start = time.perf_counter()

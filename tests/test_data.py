@@ -271,7 +271,8 @@ def download(monkeypatch, tmp_path):
 
         def call(*answers):
             servers = [stack.enter_context(Server(ANSWERS[a])) if a else None for a in answers]
-            monkeypatch.setattr(wpc, "SERVERS", [s.url if s else "http://127.0.0.1:9/" for s in servers])
+            for name, server in zip(("SERVER", "MIRROR"), servers):
+                monkeypatch.setattr(wpc, name, server.url if server else "http://127.0.0.1:9/")
             return wpc.dataset_path(wpc.Args(env="hopper-medium-replay-v2"))
 
         yield call

@@ -31,12 +31,16 @@ class Countdown(gym.Env):
         return np.array([self.left, 0, 0], np.float64), reward, over and not self.truncates, over and self.truncates, {}
 
 
+def make_actor(obs_dim, action_dim):
+    return wpc.make_networks(obs_dim, action_dim, wpc.Args(), "cpu")[0]["actor"]
+
+
 def constant_actor(action):
-    actor = wpc.Actor(3, 1, 1.0)
+    actor = make_actor(3, 1)
     with torch.no_grad():
         for p in actor.parameters():
             p.zero_()
-        actor.net[4].bias += np.arctanh(action)
+        actor[4].bias += np.arctanh(action)
     return actor
 
 
@@ -54,15 +58,15 @@ def test_only_each_first_episode_counts():
 
 
 def test_the_actor_sees_normalized_observations():
-    class Recorder(wpc.Actor):
+    class Recorder(torch.nn.Module):
         seen = []
 
         def forward(self, s):
             self.seen.append(s)
-            return super().forward(s)
+            return torch.zeros(len(s), 1)
 
     envs = gym.vector.SyncVectorEnv([Countdown] * 2)
-    wpc.evaluate(envs, Recorder(3, 1, 1.0), torch.tensor([1.0, 2, 3]), torch.tensor([2.0, 4, 8]), seed=0)
+    wpc.evaluate(envs, Recorder(), torch.tensor([1.0, 2, 3]), torch.tensor([2.0, 4, 8]), seed=0)
     assert Recorder.seen[0][:, 0].tolist() == [(length - 1) / 2 for length in first_lengths(envs, 0)]
     assert Recorder.seen[0][:, 1:].tolist() == [[-2 / 4, -3 / 8]] * 2
 
@@ -71,9 +75,8 @@ def test_the_actor_sees_normalized_observations():
 def test_same_seed_same_returns_other_seed_other_states(env):
     gym.logger.min_level = gym.logger.ERROR
     envs = gym.make_vec(env, 3, vectorization_mode="sync")
-    torch.manual_seed(0)
     obs_dim, action_dim = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
-    actor, mean, std = wpc.Actor(obs_dim, action_dim, 1.0), torch.zeros(obs_dim), torch.ones(obs_dim)
+    actor, mean, std = make_actor(obs_dim, action_dim), torch.zeros(obs_dim), torch.ones(obs_dim)
     first, again, other = (wpc.evaluate(envs, actor, mean, std, seed) for seed in (0, 0, 1))
     assert first.tolist() == again.tolist()
     assert not set(first) & set(other) and len({*first, *other}) == 6

@@ -4,6 +4,7 @@
 import re
 import subprocess
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -25,12 +26,14 @@ def test_the_diff_is_real():
     assert len(shown) > 8 and set(shown) <= {line.rstrip() for line in lines}
 
 
-def test_the_snippet_acts(tmp_path):
-    assert run(*command("wpc", "--max-timesteps", 1, "--run-dir", tmp_path)).returncode == 0
+def test_the_snippet_acts_and_evaluates(tmp_path):
+    assert run(*command("wpc", "--max-timesteps", 1, "--eval-episodes", 10, "--run-dir", tmp_path)).returncode == 0
     snippet = README.split("```python\n")[1].split("```")[0]
     variables = {"observation": np.zeros(17)}
+    gym.logger.min_level = gym.logger.ERROR
     exec(snippet.replace("runs/DIR", str(tmp_path)), variables)
     assert variables["action"].shape == (6,) and abs(variables["action"]).max() <= 1
     checkpoint = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     again = variables["actor"]((torch.zeros(1, 17) - checkpoint["mean"]) / checkpoint["std"])
     assert variables["action"] == pytest.approx(again[0].detach().numpy(), abs=1e-6)
+    assert " ".join(f"{x:.2f}" for x in variables["returns"]) == checkpoint["rows"][-1]["returns"]

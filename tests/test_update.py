@@ -8,7 +8,7 @@ import pytest
 import torch
 from conftest import SCRIPTS, td3_bc, wbc, wpc
 
-OBS, ACT, BATCH, MAX_ACTION = 5, 3, 64, 2.0
+OBS, ACT, BATCH = 5, 3, 64
 # nothing at its default, the noise clipped about half the time
 OPTIONS = dict(discount=0.9, tau=0.1, policy_noise=0.3, noise_clip=0.25, policy_lr=1e-3, q_lr=1e-4, seed=3)
 CASES = [("td3_bc", {"alpha": 1.7}), ("wbc", {"v_lr": 2e-4})]
@@ -19,7 +19,7 @@ def make(name, options):
     """A script's arguments, float64 networks, optimizers and a batch, with Q below zero and V in its midst."""
     script = SCRIPTS[name]
     args = script.Args(**OPTIONS | options)
-    networks, optimizers = script.make_networks(OBS, ACT, MAX_ACTION, args, "cpu")
+    networks, optimizers = script.make_networks(OBS, ACT, args, "cpu")
     for network in networks.values():
         network.double()
     with torch.no_grad():  # targets unlike the networks; Q < 0, where mean |Q| is not mean Q
@@ -27,12 +27,12 @@ def make(name, options):
         for name in ("actor_target", "critic_target"):
             for p in networks[name].parameters():
                 p.add_(0.05 * torch.randn(p.shape, generator=rng))
-        networks["actor_target"].net[4].weight *= 30  # saturated: noise leads beyond the largest action
+        networks["actor_target"][4].weight *= 30  # saturated: noise leads beyond the largest action
         for q in networks["critic"]:
             q[4].bias -= 0.5
     rng = torch.Generator().manual_seed(2)
     s, s_next = (torch.randn(BATCH, OBS, generator=rng).double() for _ in range(2))
-    a = (torch.rand(BATCH, ACT, generator=rng).double() * 2 - 1) * MAX_ACTION
+    a = torch.rand(BATCH, ACT, generator=rng).double() * 2 - 1
     r = torch.randn(BATCH, 1, generator=rng).double()
     not_done, half = (torch.rand(2, BATCH, 1, generator=rng) < 0.6).double()
     if "value" in networks:
@@ -60,8 +60,8 @@ def q_values(p, s, a):
 def critic_losses(p, batch, args, noise):
     """y, Q1, V and both losses, as in Algorithm 1, from the parameters before the step."""
     s, a, r, not_done, s_next = batch[:5]
-    noise = np.clip(args.policy_noise * noise, -args.noise_clip, args.noise_clip) * MAX_ACTION
-    a_next = np.clip(MAX_ACTION * np.tanh(mlp(p["actor_target"], s_next)) + noise, -MAX_ACTION, MAX_ACTION)
+    noise = np.clip(args.policy_noise * noise, -args.noise_clip, args.noise_clip)
+    a_next = np.clip(np.tanh(mlp(p["actor_target"], s_next)) + noise, -1, 1)
     y = r + args.discount * not_done * np.minimum(*q_values(p["critic_target"], s_next, a_next))
     q1, q2 = q_values(p["critic"], s, a)
     values = {"target_q": y.mean(), "q": q1.mean(), "critic_loss": ((q1 - y) ** 2).mean() + ((q2 - y) ** 2).mean()}
@@ -74,7 +74,7 @@ def critic_losses(p, batch, args, noise):
 def actor_losses(p, batch, args, weight, lmbda=None):
     """lambda and the actor's loss, with a given weight; lambda is a constant to the gradient."""
     s, a = batch[:2]
-    pi = MAX_ACTION * np.tanh(mlp(p["actor"], s))
+    pi = np.tanh(mlp(p["actor"], s))
     values = {"action_distance": np.abs(pi - a).mean(), "actor_loss": (weight * (pi - a) ** 2).mean()}
     if hasattr(args, "alpha"):
         q = q_values(p["critic"], s, pi)[0]
@@ -159,22 +159,22 @@ def test_policy_and_targets_move_every_policy_freq_steps(script, policy_freq, st
 
 
 def test_networks_are_table_4s_and_start_alike():
-    networks = {n: s.make_networks(OBS, ACT, MAX_ACTION, s.Args(seed=5), "cpu")[0] for n, s in SCRIPTS.items()}
+    networks = {n: s.make_networks(OBS, ACT, s.Args(seed=5), "cpu")[0] for n, s in SCRIPTS.items()}
     shapes = [tuple(p.shape) for p in networks["wpc"]["value"].parameters()]
     assert shapes == [(256, OBS), (256,), (256, 256), (256,), (1, 256), (1,)]
     for other in ("td3_bc", "wbc"):
         for name, network in networks[other].items():
             for p, q in zip(network.parameters(), networks["wpc"][name].parameters(), strict=True):
                 assert torch.equal(p, q)
-    actor, other_seed = networks["wpc"]["actor"], wpc.make_networks(OBS, ACT, MAX_ACTION, wpc.Args(seed=6), "cpu")[0]["actor"]
-    assert not torch.equal(actor.net[0].weight, other_seed.net[0].weight)
-    assert actor(1e6 * torch.ones(1, OBS)).abs().max() == MAX_ACTION
+    actor, other_seed = networks["wpc"]["actor"], wpc.make_networks(OBS, ACT, wpc.Args(seed=6), "cpu")[0]["actor"]
+    assert not torch.equal(actor[0].weight, other_seed[0].weight)
+    assert actor(1e6 * torch.ones(1, OBS)).abs().max() == 1
 
 
 def twenty_steps(script, options, forced=None):
     """Networks after 20 steps on float32 batches sampled as in `train`; `forced` is put into the last column."""
     args = script.Args(seed=1, **options)
-    networks, optimizers = script.make_networks(OBS, ACT, 1.0, args, "cpu")
+    networks, optimizers = script.make_networks(OBS, ACT, args, "cpu")
     data, rng = torch.randn(500, 2 * OBS + ACT + 3, generator=torch.Generator().manual_seed(0)), torch.Generator().manual_seed(1)
     for step in range(1, 21):
         rows = data[torch.randint(len(data), (256,), generator=rng)]
@@ -202,7 +202,7 @@ def test_wpc_without_the_q_term_is_wbc():
 
 def test_td3_bc_with_alpha_zero_is_behaviour_cloning():
     args = td3_bc.Args(seed=1)
-    actor = td3_bc.make_networks(OBS, ACT, 1.0, args, "cpu")[0]["actor"]
+    actor = td3_bc.make_networks(OBS, ACT, args, "cpu")[0]["actor"]
     optimizer = torch.optim.Adam(actor.parameters(), 3e-4, fused=True)
     data, rng = torch.randn(500, 2 * OBS + ACT + 3, generator=torch.Generator().manual_seed(0)), torch.Generator().manual_seed(1)
     for step in range(1, 21):
@@ -218,9 +218,9 @@ def test_td3_bc_with_alpha_zero_is_behaviour_cloning():
 def weights(kind, advantage, seed=0, **options):
     """wpc's weights for given advantages, read off the actor's gradient-free loss: one row a batch entry."""
     args = wpc.Args(alpha=0.0, weight=kind, policy_lr=0.0, q_lr=0.0, v_lr=0.0, **options)
-    networks, optimizers = wpc.make_networks(1, 1, 1.0, args, "cpu")
+    networks, optimizers = wpc.make_networks(1, 1, args, "cpu")
     with torch.no_grad():
-        for network in (*networks["critic"], networks["value"], networks["actor"].net):
+        for network in (*networks["critic"], networks["value"], networks["actor"]):
             for p in network.parameters():
                 p.zero_()
         q1 = networks["critic"][0]  # Q1(s, a) = relu(s) - relu(-s) = s, V = 0, pi = 0
