@@ -4,9 +4,11 @@
     python tests/benchmark.py
 
 All variants take turns in one process, so that whatever else the machine does meets all of them; ratios of medians
-come first, as they carry over to other machines. After that: evaluation, loading and start-up.
+come first, as they carry over to other machines. After that: evaluation, loading, start-up, and runs side by side.
 """
 
+import csv
+import os
 import subprocess
 import sys
 import tempfile
@@ -36,7 +38,6 @@ BATCH, ROWS = 256, 200_000
 class Args:
     rounds: int = 15  # turns of each variant
     steps: int = 60  # training steps of a turn
-    only_steps: bool = False  # leave out evaluation, loading and start-up
 
 
 def script_steps(script, obs_dim, action_dim):
@@ -205,11 +206,29 @@ def benchmark_start(folder):
     print(f"start-up, with one step and two evaluations of one episode: {np.median(times):.1f} s")
 
 
+def benchmark_side_by_side(folder, args):
+    """A run with all threads, and as many runs at once with one thread each: what the machine does in all, in turns."""
+    cores, steps = torch.get_num_threads(), 20 * args.steps
+    line = f"--env halfcheetah --dataset tests/data/halfcheetah_replay.hdf5 --max-timesteps {steps} --log-freq {steps} --eval-episodes 1 --run-dir"
+    totals = {1: [], cores: []}
+    for turn in range(3):
+        for threads, rates in totals.items():
+            environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
+            folders = [folder / f"{turn} {threads} {run}" for run in range(cores // threads)]
+            commands = [[sys.executable, "wpc.py", *line.split(), str(f)] for f in folders]
+            runs = [subprocess.Popen(c, cwd=ROOT, env=environment, stdout=subprocess.DEVNULL) for c in commands]
+            assert not any([run.wait() for run in runs])
+            last = [list(csv.DictReader((f / "evaluations.csv").open()))[-1] for f in folders]
+            rates.append(sum(float(row["steps_per_second"]) for row in last))
+    for threads, rates in totals.items():
+        print(f"{cores // threads} run(s) of wpc with {threads} thread(s) each: {np.median(rates):.0f} steps/s in all")
+
+
 if __name__ == "__main__":
     args = tyro.cli(Args, description=__doc__)
     results = benchmark_steps(args)
-    if not args.only_steps:
-        benchmark_evaluation(results)
-        with tempfile.TemporaryDirectory() as folder:
-            benchmark_loading(Path(folder))
-            benchmark_start(Path(folder))
+    benchmark_evaluation(results)
+    with tempfile.TemporaryDirectory() as folder:
+        benchmark_loading(Path(folder))
+        benchmark_start(Path(folder))
+        benchmark_side_by_side(Path(folder), args)
