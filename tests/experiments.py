@@ -106,12 +106,13 @@ def cell(values):
 
 
 def table(runs, names, systems, tasks):
-    """A Markdown table: for each system the last evaluation, the mean of the last ten, seeds and the paper's value."""
-    lines = ["| task | " + " | ".join(f"{LABELS[s]}: last | last ten | seeds | paper" for s in systems) + " |"]
-    lines.append("|" + "---|" * (1 + 4 * len(systems)))
+    """A Markdown table: steps, and for each system the last evaluation, the mean of the last ten, seeds, the paper's value."""
+    lines = ["| task | steps | " + " | ".join(f"{LABELS[s]}: last | last ten | seeds | paper" for s in systems) + " |"]
+    lines.append("|" + "---|" * (2 + 4 * len(systems)))
     sums = {}
     for task in tasks:
-        cells = [names[task]]
+        steps = {int(c["step"][-1]) for system in systems for c in runs.get((system, task), {}).values()}
+        cells = [names[task], " to ".join(f"{step:,}" for step in sorted({min(steps), max(steps)}))]
         for system in systems:
             seeds = runs.get((system, task), {}).values()
             paper = PAPER[system][TASKS.index(task)] if system in PAPER and task in TASKS else None
@@ -121,7 +122,7 @@ def table(runs, names, systems, tasks):
             for i, values in enumerate((last, ten, [] if paper is None else [paper])):
                 sums.setdefault((system, i), []).append(np.mean(values) if values else np.nan)
         lines.append("| " + " | ".join(cells) + " |")
-    total = ["total"]
+    total = ["total", ""]
     for system in systems:
         values = ["missing" if np.isnan(sums[system, i]).any() else f"{sum(sums[system, i]):.1f}" for i in range(3)]
         total += [values[0], values[1], "", values[2]]
@@ -172,10 +173,9 @@ def report(args):
         sys.exit(f"{args.runs} holds no run folders named <system>__<task>__<seed>: run what `list` prints")
     args.out.mkdir(parents=True, exist_ok=True)
     tasks = [task for task in TASKS if task in names] + sorted(names.keys() - set(TASKS))
-    steps = sorted({int(c["step"][-1]) for seeds in runs.values() for c in seeds.values()})
     text = [
-        "Normalized scores, mean ± sample standard deviation (ddof = 1) over seeds, at the end of "
-        f"{' or '.join(f'{s:,}' for s in steps)} training steps. The paper's values: 5 seeds, 1,000,000 steps, D4RL's files.\n"
+        "Normalized scores, mean ± sample standard deviation (ddof = 1) over seeds: the last evaluation, and the mean of the "
+        "last ten. Steps are those that each run has done. The paper's values: 5 seeds, 1,000,000 steps, D4RL's files.\n"
     ]
     for title, experiment in (("Table 1", "table1"), ("Table 2", "table2"), ("Figure 4", "figure4")):
         systems, own = EXPERIMENTS[experiment]
