@@ -185,7 +185,8 @@ def report(args):
     figure(args.out / "figure2.png", runs, names, EXPERIMENTS["table1"][0], tasks, ["score"])
     figure(args.out / "figure3.png", runs, names, EXPERIMENTS["table1"][0], tasks, ["q"])
     figure(args.out / "figure4.png", runs, names, EXPERIMENTS["figure4"][0], EXPERIMENTS["figure4"][1], ["q", "score"])
-    figure(args.out / "figure5.png", runs, names, EXPERIMENTS["table2"][0], tasks, ["score"])
+    rivals = [t for t in tasks if any((s, t) in runs for s in ("wpc-exponential", "wpc-random"))]
+    figure(args.out / "figure5.png", runs, names, EXPERIMENTS["table2"][0], rivals, ["score"])
     print("\n".join(text) + f"\nwritten to {args.out}/")
 
 
