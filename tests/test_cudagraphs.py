@@ -6,7 +6,6 @@ the host wait for the device, and any random number from a generator that was no
 the recorded operations on the recorded memory, and no line of Python. The device itself has not been tried.
 """
 
-import copy
 import signal
 
 import pytest
@@ -90,7 +89,7 @@ def train(script, monkeypatch, tmp_path):
         default = dict(max_timesteps=60, eval_freq=30, eval_episodes=1, log_freq=7, batch_size=32, device="cpu")
         args = script.Args(env="halfcheetah", dataset=str(DATASET), run_dir=str(tmp_path / folder), **default | options)
         args.alpha = 2.5
-        script.train(copy.copy(args))
+        script.train(args)
         end = result(tmp_path / folder)
         end[0]["args"].pop("cudagraphs")
         return end
