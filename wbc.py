@@ -1,13 +1,35 @@
 # SPDX-License-Identifier: MIT
-"""wBC: weighted behavior cloning, the imitation in wPC (Peng et al., AAAI 2023, the paper below) alone, in one file.
+"""wBC: weighted behaviour cloning for offline reinforcement learning, in one file.
 
-The policy imitates the dataset's actions, but only those that are better than average (eq. 6 with lmbda = 0, eq. 7):
+The policy imitates the dataset's actions, but only those that are better than average:
 
-    pi = argmin E[ w(s, a) * (pi(s) - a)^2 ],  w(s, a) = 1 if Q(s, a) > V(s) else 0
+    pi = argmin E[w(s, a) * (pi(s) - a)^2]                 (eq. 6 with lambda = 0)
+    w(s, a) = 1 if Q(s, a) > V(s), else 0                  (eq. 7)
+
+Equations and Algorithm 1 are those of Peng, Han, Liu and Zhou, "Weighted Policy
+Constraints for Offline Reinforcement Learning", AAAI 2023 (below: the paper).
+
+    python wbc.py --env hopper-medium-v2
+    python wbc.py --env halfcheetah --dataset tests/data/halfcheetah_replay.hdf5
 """
 
-import contextlib, copy, csv, fcntl, hashlib, io, json, os, signal, socket, sys, threading, time, warnings, zipfile
+import contextlib
+import copy
+import csv
+import fcntl
+import hashlib
+import io
+import json
+import os
+import pickle
+import signal
+import socket
+import sys
+import threading
+import time
+import warnings
 from dataclasses import asdict, dataclass
+from http.client import HTTPException
 from pathlib import Path
 from typing import Literal
 
@@ -21,363 +43,705 @@ import tyro
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-SCRIPT = Path(__file__).stem
-ROBOTS = {  # Gymnasium's environment (-v4 is the closest to D4RL's -v2), and the returns that D4RL scores 0 and 100
+
+@dataclass
+class Args:
+    # Experiment
+    env: str = "hopper-medium-v2"
+    """D4RL task; with --dataset, also just halfcheetah, hopper or walker2d"""
+    dataset: str | None = None
+    """HDF5 file in D4RL's format; by default the task's, downloaded on first use"""
+    seed: int = 0
+    """seed of the networks, batches, noise and evaluation episodes"""
+    max_timesteps: int = 1_000_000
+    """number of training steps"""
+    eval_freq: int = 5_000
+    """evaluate and save a checkpoint every this many steps"""
+    eval_episodes: int = 10
+    """number of episodes in an evaluation"""
+    log_freq: int = 1_000
+    """log the losses to TensorBoard every this many steps"""
+    device: Literal["cpu", "cuda"] = "cuda" if torch.cuda.is_available() else "cpu"
+    """where to train; by default on a GPU if there is one"""
+    run_dir: str | None = None
+    """folder to start the run in, or to continue it; by default a new one in runs/"""
+
+    # TD3
+    batch_size: int = 256
+    """number of transitions in a batch"""
+    discount: float = 0.99
+    """discount factor gamma"""
+    tau: float = 0.005
+    """rate at which the target networks follow the networks"""
+    policy_noise: float = 0.2
+    """standard deviation of the noise on the target action, relative to max_action"""
+    noise_clip: float = 0.5
+    """largest noise on the target action, relative to max_action"""
+    policy_freq: int = 2
+    """update the policy and the target networks every this many steps"""
+    actor_lr: float = 3e-4
+    """learning rate of the actor"""
+    critic_lr: float = 3e-4
+    """learning rate of the critics"""
+    normalize: bool = True
+    """normalize the states to mean 0 and standard deviation 1 over the dataset"""
+
+    # Policy constraint
+    value_lr: float = 3e-4
+    """learning rate of the value network"""
+
+
+# --------------------------------------------------------------------------------------
+# Networks
+# --------------------------------------------------------------------------------------
+
+
+def mlp(input_dim, output_dim):
+    """Two hidden layers of 256 units with ReLU (Table 4)."""
+    return nn.Sequential(
+        nn.Linear(input_dim, 256),
+        nn.ReLU(inplace=True),
+        nn.Linear(256, 256),
+        nn.ReLU(inplace=True),
+        nn.Linear(256, output_dim),
+    )
+
+
+class Actor(nn.Module):
+    """The policy pi(s): states (B, state_dim) to actions (B, action_dim)."""
+
+    def __init__(self, state_dim, action_dim, max_action):
+        super().__init__()
+        self.net = mlp(state_dim, action_dim)
+        self.max_action = max_action
+
+    def forward(self, s):
+        return self.max_action * torch.tanh(self.net(s))
+
+
+class Critic(nn.Module):
+    """Q1(s, a) and Q2(s, a), each (B, 1)."""
+
+    def __init__(self, state_dim, action_dim):
+        super().__init__()
+        self.q1_net = mlp(state_dim + action_dim, 1)
+        self.q2_net = mlp(state_dim + action_dim, 1)
+
+    def forward(self, s, a):
+        sa = torch.cat([s, a], dim=1)
+        return self.q1_net(sa), self.q2_net(sa)
+
+    def q1(self, s, a):
+        return self.q1_net(torch.cat([s, a], dim=1))
+
+
+class Value(nn.Module):
+    """V(s): (B, 1)."""
+
+    def __init__(self, state_dim):
+        super().__init__()
+        self.net = mlp(state_dim, 1)
+
+    def forward(self, s):
+        return self.net(s)
+
+
+# --------------------------------------------------------------------------------------
+# Algorithm 1
+# --------------------------------------------------------------------------------------
+
+
+class Agent(nn.Module):
+    """The networks with their optimizers, and the update of Algorithm 1."""
+
+    def __init__(self, state_dim, action_dim, max_action, args):
+        super().__init__()
+        self.args = args
+
+        self.critic = Critic(state_dim, action_dim)
+        self.critic_target = copy.deepcopy(self.critic).requires_grad_(False)
+        self.critic_optimizer = adam(self.critic, args.critic_lr)
+
+        self.actor = Actor(state_dim, action_dim, max_action)
+        self.actor_target = copy.deepcopy(self.actor).requires_grad_(False)
+        self.actor_optimizer = adam(self.actor, args.actor_lr)
+
+        self.value = Value(state_dim)
+        self.value_optimizer = adam(self.value, args.value_lr)
+
+        self.optimizers = [self.critic_optimizer, self.actor_optimizer]
+        self.optimizers += [self.value_optimizer]
+
+    def update(self, batch, step):
+        """Does step `step` (1, 2, ...) of Algorithm 1 and returns its metrics by name.
+
+        `batch` holds tensors (B, width) under the names that `load_dataset` gives them.
+        """
+        args, max_action = self.args, self.actor.max_action
+        s, a, r = batch["observations"], batch["actions"], batch["rewards"]
+        s_next, done = batch["next_observations"], batch["terminals"]
+
+        # Target: the smaller of the two target Q-values, at a noisy next action
+        with torch.no_grad():
+            noise = args.policy_noise * torch.randn_like(a)
+            noise = max_action * noise.clamp(-args.noise_clip, args.noise_clip)
+            a_next = self.actor_target(s_next) + noise
+            a_next = a_next.clamp(-max_action, max_action)
+            q1_next, q2_next = self.critic_target(s_next, a_next)
+            y = r + args.discount * (1 - done) * torch.min(q1_next, q2_next)
+
+        # Critics: Q1 and Q2 fit the target
+        q1, q2 = self.critic(s, a)
+        critic_loss = F.mse_loss(q1, y) + F.mse_loss(q2, y)
+        self.critic_optimizer.zero_grad()
+        critic_loss.backward()
+        self.critic_optimizer.step()
+        metrics = {"q": q1.mean(), "critic_loss": critic_loss}
+
+        # Value: V fits the same target, and so the mean of Q over the dataset's actions
+        v = self.value(s)
+        value_loss = F.mse_loss(v, y)
+        self.value_optimizer.zero_grad()
+        value_loss.backward()
+        self.value_optimizer.step()
+        metrics |= {"v": v.mean(), "value_loss": value_loss}
+
+        if step % args.policy_freq == 0:
+            # Weight: 1 on the actions that are better than average, else 0
+            with torch.no_grad():
+                advantage = self.critic.q1(s, a) - self.value(s)
+                weight = (advantage > 0).float()  # eq. 7
+            metrics["weight"] = weight.mean()
+
+            # Policy: imitate the actions of weight 1
+            pi = self.actor(s)
+            actor_loss = (weight * (pi - a) ** 2).mean()  # eq. 6 with lambda = 0
+            self.actor_optimizer.zero_grad()
+            actor_loss.backward()
+            self.actor_optimizer.step()
+            metrics["actor_loss"] = actor_loss
+
+            # Targets: follow the critics and the actor
+            soft_update(self.critic_target, self.critic, args.tau)
+            soft_update(self.actor_target, self.actor, args.tau)
+
+        return {name: metric.detach() for name, metric in metrics.items()}
+
+
+def adam(network, learning_rate):
+    # Fused, as it makes a training step on a CPU a tenth faster.
+    return torch.optim.Adam(network.parameters(), lr=learning_rate, fused=True)
+
+
+@torch.no_grad()
+def soft_update(target, network, tau):
+    """target <- (1 - tau) * target + tau * network"""
+    parameters = zip(target.parameters(), network.parameters(), strict=True)
+    for target_parameter, parameter in parameters:
+        target_parameter.lerp_(parameter, tau)
+
+
+# --------------------------------------------------------------------------------------
+# Evaluation
+# --------------------------------------------------------------------------------------
+
+ENVIRONMENTS = {
+    # Gymnasium's environment, and the returns that D4RL scores 0 and 100. Of all
+    # versions, -v4 is the closest to the -v2 with mujoco-py that D4RL evaluates on.
     "halfcheetah": ("HalfCheetah-v4", -280.178953, 12135.0),
     "hopper": ("Hopper-v4", -20.272305, 3234.3),
     "walker2d": ("Walker2d-v4", 1.629008, 4592.3),
 }
-KINDS = ("random", "medium", "medium-replay", "full-replay", "medium-expert", "expert")
-SHA256 = {  # the first 16 digits for D4RL's file of each kind
-    "halfcheetah": "25407aef85b5d16c 41324e8487a9556d 48d494a4770c11f4 27fdf7ea86e5a2cb 015db75dae5bbe8e d9fe53bb994eb1e2",
-    "hopper": "63103ef7059db4c0 5bdf1bc4a713c829 e121c5f7c9857a30 56baf95963c51c1e 9d51ad87f8c905be 01aa219a5f8eea5e",
-    "walker2d": "4e863bb6090cf4a4 cf00f43add04c17f e75de96a4f77acf7 f2720f9d27b2acef 6b8d7f868c45bbae 2985dc3d436a8baa",
-}
-SERVER = "http://rail.eecs.berkeley.edu/datasets/offline_rl/gym_mujoco_v2/"  # D4RL's own, often down
-MIRROR = "https://huggingface.co/datasets/imone/D4RL/resolve/main/"
 
 
-@dataclass
-class Args:
-    env: str = "hopper-medium-v2"  # D4RL task or, with --dataset, just the robot: halfcheetah, hopper, walker2d
-    dataset: str | None = None  # HDF5 file in D4RL's format; by default D4RL's for --env, downloaded on first use
-    seed: int = 0  # of the networks, the batches and the noise, and, plus 100, of the evaluation's initial states
-    max_timesteps: int = 1_000_000  # training steps
-    eval_freq: int = 5_000  # training steps from one evaluation, with its checkpoint, to the next
-    eval_episodes: int = 10  # episodes of an evaluation
-    batch_size: int = 256  # transitions of a training step
-    discount: float = 0.99  # gamma
-    tau: float = 0.005  # rate at which the target networks follow
-    policy_noise: float = 0.2  # sigma of the noise on the target's action
-    noise_clip: float = 0.5  # bound c of that noise
-    policy_freq: int = 2  # training steps from one update of the policy, and of all targets, to the next
-    policy_lr: float = 3e-4  # learning rate of the policy
-    q_lr: float = 3e-4  # learning rate of the critics
-    v_lr: float = 3e-4  # learning rate of V
-    normalize: bool = True  # shift and scale the observations to mean 0 and standard deviation 1 over the dataset
-    device: Literal["auto", "cpu", "cuda"] = "auto"  # where to train; auto takes a GPU if there is one
-    cudagraphs: bool = False  # on a GPU: launch each training step as one CUDA graph; no GPU has run this yet
-    log_freq: int = 1_000  # training steps from one entry in TensorBoard, a mean over them, to the next
-    run_dir: str | None = None  # folder of the run, begun or continued; by default a new one under runs/
+def make_envs(env, num_envs):
+    """`num_envs` of Gymnasium's environments for a task or robot, stepped together."""
+    warnings.filterwarnings("ignore", message=".*out of date")  # -v4 is what we want
+    env_id = ENVIRONMENTS[env.split("-")[0]][0]
+    return gym.make_vec(env_id, num_envs, vectorization_mode="sync")
 
 
-def mlp(inputs, outputs):
-    relu = nn.ReLU(inplace=True)
-    return nn.Sequential(nn.Linear(inputs, 256), relu, nn.Linear(256, 256), relu, nn.Linear(256, outputs))
+def normalized_score(returns, env):
+    """D4RL's score of these returns: 0 for a random policy's, 100 for an expert's."""
+    _, random_return, expert_return = ENVIRONMENTS[env.split("-")[0]]
+    return 100 * (returns - random_return) / (expert_return - random_return)
 
 
-def make_networks(obs_dim, action_dim, args, device):
-    """The networks of Table 4 and the optimizers of those that learn: two dicts by name, fixed by `args.seed`."""
-    torch.manual_seed(args.seed)
-    critic = nn.ModuleList(mlp(obs_dim + action_dim, 1) for _ in range(2))  # Q1 and Q2
-    actor = mlp(obs_dim, action_dim).append(nn.Tanh())  # pi: normalized s -> a within +-1, each robot's limits
-    networks = {"actor": actor, "critic": critic}
-    networks |= {f"{name}_target": copy.deepcopy(network).requires_grad_(False) for name, network in networks.items()}
-    networks["value"] = mlp(obs_dim, 1)  # V, made last: actor and critics start as they do in td3_bc.py
-    networks = {name: network.to(device) for name, network in networks.items()}
-    optimizers = {"actor": torch.optim.Adam(actor.parameters(), args.policy_lr, fused=True, capturable=True)}
-    optimizers["critic"] = torch.optim.Adam(critic.parameters(), args.q_lr, fused=True, capturable=True)
-    optimizers["critic"].add_param_group({"params": list(networks["value"].parameters()), "lr": args.v_lr})
-    return networks, optimizers
-
-
-def dataset_path(args):
-    """The file of --dataset, or D4RL's for --env, downloaded if need be; exits with a sentence if there is none."""
-    robot, _, kind = args.env.removesuffix("-v2").partition("-")
-    folder = Path(os.environ.get("D4RL_DATASET_DIR") or Path.home() / ".d4rl/datasets")
-    path = Path(args.dataset or folder / f"{robot}_{kind.replace('-', '_')}-v2.hdf5")
-    problems = []
-    for server in () if args.dataset or path.exists() else (SERVER, MIRROR):
-        try:  # into a temporary file, moved to its place when it is complete and right
-            folder.mkdir(parents=True, exist_ok=True)
-            socket.setdefaulttimeout(30)  # seconds that a server may be silent
-            torch.hub.download_url_to_file(server + path.name, path, SHA256[robot].split()[KINDS.index(kind)])
-            break
-        except Exception as error:  # of the network, of HTTP, of the digest: the next server may do
-            problems.append(f"; {server}: {error}")
-    if not path.exists():
-        ships = "--env halfcheetah --dataset tests/data/halfcheetah_replay.hdf5 ships with the project"
-        sys.exit(f"there is no {path}{''.join(problems)}: put D4RL's file there, or name one with --dataset ({ships})")
-    return path
-
-
-def read_column(file, key, rows, width):
-    """`file[key]` as finite float32 (rows, width); exits with a sentence where it is not."""
-    shape = getattr(file.get(key), "shape", "missing")
-    if shape != (rows, width) and (shape, width) != ((rows,), 1):
-        sys.exit(f"{file.filename}: '{key}' is {shape}, where {(rows, width)} was expected")
-    column = file[key][:].astype(np.float32, copy=False).reshape(rows, width)
-    if not np.isfinite(column).all():
-        sys.exit(f"{file.filename}: '{key}' is not finite in row {np.argwhere(~np.isfinite(column))[0, 0]}")
-    return column
-
-
-def episode_steps(end):
-    """Each row's episode and its step within it, both (rows,), from `end` (rows,), true on an episode's last row."""
-    episode = np.cumsum(end) - end
-    return episode, np.arange(len(end)) - np.searchsorted(episode, episode)
-
-
-def load_dataset(path, obs_dim, action_dim, args):
-    """The transitions of `d4rl.qlearning_dataset` from an HDF5 file in D4RL's format, on the CPU.
-
-    Row i becomes (o[i], a[i], r[i], o[i+1], terminal[i]). Rows that end an episode by a timeout are dropped, for their
-    o[i+1] belongs to the next episode, and so is the last row. Without `timeouts`, an episode ends after 1000 steps.
-
-    Returns transitions, float32 (N, sum(widths)), whose columns are s, a, r, not_done, s_next;
-    then mean and std, float32 (obs_dim,), that normalize s and s_next; widths; returns, float64 (episodes,), and the
-    best discounted one. Exits with a sentence if the file is no HDF5, damaged, incomplete, empty or does not fit.
-    """
-    try:
-        with h5py.File(path) as file:
-            rows = len(file["observations"]) if "observations" in file else 0
-            observations = read_column(file, "observations", rows, obs_dim)
-            actions = read_column(file, "actions", rows, action_dim)
-            rewards = read_column(file, "rewards", rows, 1)
-            terminal = read_column(file, "terminals", rows, 1)[:, 0] != 0
-            timeout = episode_steps(terminal)[1] % 1000 == 999  # d4rl's own count is off by one after a terminal
-            if "timeouts" in file:
-                timeout = read_column(file, "timeouts", rows, 1)[:, 0] != 0
-    except Exception as error:  # which one h5py raises depends on the byte that is wrong
-        sys.exit(f"{path} is no HDF5 file, or is damaged or cut short ({error})")
-    keep = np.flatnonzero(~timeout[:-1])
-    if len(keep) == 0:
-        sys.exit(f"{path} has no transitions, only {rows} rows")
-    episode, t = episode_steps(terminal | timeout)
-    returns = np.bincount(episode, rewards[:, 0])
-    best_return = np.bincount(episode, rewards[:, 0] * args.discount**t).max()
-    columns = [observations, actions, rewards, ~terminal[:, None], observations[1:]]
-    widths = [column.shape[1] for column in columns]
-    transitions = np.empty((len(keep), sum(widths)), np.float32)  # one array: a batch is one look-up
-    views = np.split(transitions, np.cumsum(widths)[:-1], axis=1)
-    for view, column in zip(views, columns):
-        view[:] = column[keep]
-    mean = np.float32([x.mean(dtype=np.float64) if args.normalize else 0 for x in views[0].T])
-    std = np.float32([x.std(dtype=np.float64) + 1e-3 if args.normalize else 1 for x in views[0].T])
-    for s in (views[0], views[4]):
-        np.divide(s - mean, std, out=s)
-    return *map(torch.from_numpy, (transitions, mean, std)), widths, returns, float(best_return)
-
-
-@torch.inference_mode()
+@torch.no_grad()
 def evaluate(envs, actor, mean, std, seed):
-    """The return of the first episode of each of `envs`, float64 (num_envs,); `seed` fixes the initial states."""
-    actor = copy.deepcopy(actor).cpu()  # where so small a batch is faster
-    observations, _ = envs.reset(seed=np.random.SeedSequence(seed + 100).generate_state(envs.num_envs).tolist())
-    returns, running = np.zeros(envs.num_envs), np.ones(envs.num_envs, bool)
+    """Plays an episode in each of `envs` at once; returns their returns (num_envs,).
+
+    `mean` and `std`, tensors (state_dim,), normalize the observations as in training.
+    """
+    # Environment i gets this plus i as its seed, so no two seeds share an episode.
+    observations, _ = envs.reset(seed=1000 * (seed + 100))
+    returns = np.zeros(envs.num_envs)
+    running = np.ones(envs.num_envs, dtype=bool)
     while running.any():
-        s = (torch.as_tensor(observations, dtype=torch.float32) - mean) / std
-        observations, rewards, terminated, truncated, _ = envs.step(actor(s).numpy())
-        returns += running * rewards
+        states = torch.as_tensor(observations, dtype=torch.float32, device=mean.device)
+        actions = actor((states - mean) / std).cpu().numpy()
+        observations, rewards, terminated, truncated, _ = envs.step(actions)
+        returns += rewards * running  # what follows the first episode does not count
         running &= ~(terminated | truncated)
     return returns
 
 
-def minimize(loss, optimizer):
-    """One step of Adam on the optimizer's own parameters: the actor's loss reaches the critics' as well."""
-    optimizer.zero_grad()
-    loss.backward(inputs=[parameter for group in optimizer.param_groups for parameter in group["params"]])
-    optimizer.step()
+# --------------------------------------------------------------------------------------
+# Dataset
+# --------------------------------------------------------------------------------------
+
+D4RL_SERVERS = (
+    "http://rail.eecs.berkeley.edu/datasets/offline_rl/gym_mujoco_v2/",  # often down
+    "https://huggingface.co/datasets/imone/D4RL/resolve/main/",  # a copy of its files
+)
+D4RL_SHA256 = {  # the first digits for each task's file
+    "halfcheetah-random-v2": "25407aef85b5d16c",
+    "halfcheetah-medium-v2": "41324e8487a9556d",
+    "halfcheetah-medium-replay-v2": "48d494a4770c11f4",
+    "halfcheetah-full-replay-v2": "27fdf7ea86e5a2cb",
+    "halfcheetah-medium-expert-v2": "015db75dae5bbe8e",
+    "halfcheetah-expert-v2": "d9fe53bb994eb1e2",
+    "hopper-random-v2": "63103ef7059db4c0",
+    "hopper-medium-v2": "5bdf1bc4a713c829",
+    "hopper-medium-replay-v2": "e121c5f7c9857a30",
+    "hopper-full-replay-v2": "56baf95963c51c1e",
+    "hopper-medium-expert-v2": "9d51ad87f8c905be",
+    "hopper-expert-v2": "01aa219a5f8eea5e",
+    "walker2d-random-v2": "4e863bb6090cf4a4",
+    "walker2d-medium-v2": "cf00f43add04c17f",
+    "walker2d-medium-replay-v2": "e75de96a4f77acf7",
+    "walker2d-full-replay-v2": "f2720f9d27b2acef",
+    "walker2d-medium-expert-v2": "6b8d7f868c45bbae",
+    "walker2d-expert-v2": "2985dc3d436a8baa",
+}
 
 
-def update(networks, optimizers, batch, args, step, rng):
-    """Step `step` (from 1 on) of Algorithm 1, on columns (B, width) of `load_dataset`; returns its metrics by name."""
-    actor, critic, actor_target, critic_target, *_ = networks.values()
-    value = networks["value"]
-    s, a, r, not_done, s_next = batch
+def download_dataset(task):
+    """The path of D4RL's file for `task`, downloaded if d4rl's folder has none.
 
-    with torch.no_grad():
-        noise = args.policy_noise * torch.randn(a.shape, generator=rng, device=a.device)
-        a_next = (actor_target(s_next) + noise.clamp(-args.noise_clip, args.noise_clip)).clamp(-1, 1)
-        sa_next = torch.cat([s_next, a_next], 1)
-        y = r + args.discount * not_done * torch.minimum(*(q(sa_next) for q in critic_target))
-
-    sa = torch.cat([s, a], 1)
-    q1, q2 = (q(sa) for q in critic)
-    critic_loss = F.mse_loss(q1, y) + F.mse_loss(q2, y)
-    metrics = {"q": q1.mean(), "target_q": y.mean(), "critic_loss": critic_loss}
-    v = value(s)
-    v_loss = F.mse_loss(v, y)
-    metrics |= {"v": v.mean(), "v_loss": v_loss}
-    minimize(critic_loss + v_loss, optimizers["critic"])
-
-    if step % args.policy_freq == 0:
-        with torch.no_grad():
-            advantage = critic[0](sa) - value(s)  # both as this step's updates left them
-            weight = (advantage > 0).float()  # eq. 7
-        pi = actor(s)
-        actor_loss = (weight * (pi - a) ** 2).mean()  # eq. 6 with lmbda = 0
-        minimize(actor_loss, optimizers["actor"])
-        metrics |= {"actor_loss": actor_loss, "action_distance": (pi - a).abs().mean()}
-        metrics["weight"] = (weight > 0).float().mean()
-
-        with torch.no_grad():
-            for target, network in ((critic_target, critic), (actor_target, actor)):
-                torch._foreach_lerp_(list(target.parameters()), list(network.parameters()), args.tau)
-    return {name: metric.detach() for name, metric in metrics.items()}
+    Exits with a sentence if no server has it.
+    """
+    folder = os.environ.get("D4RL_DATASET_DIR") or Path.home() / ".d4rl/datasets"
+    name = task.removesuffix("-v2").replace("-", "_") + "-v2.hdf5"
+    path = Path(folder, name).absolute()
+    if path.exists():
+        return path
+    problems = []
+    socket.setdefaulttimeout(30)  # seconds that a server may be silent
+    for server in D4RL_SERVERS:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            torch.hub.download_url_to_file(server + name, path, D4RL_SHA256[task])
+            return path
+        except (OSError, HTTPException, RuntimeError) as error:  # RuntimeError: SHA-256
+            problems.append(f"{server}: {error}")
+    sys.exit(
+        f"{path} could not be downloaded ({'; '.join(problems)}): put D4RL's file "
+        "there, or name one with --dataset (the project comes with "
+        "--env halfcheetah --dataset tests/data/halfcheetah_replay.hdf5)"
+    )
 
 
-def parse_args(argv=None):
-    """The arguments, checked; where --run-dir holds a run, those not given are its own."""
-    args = tyro.cli(Args, args=argv, description=__doc__)
-    if checkpoint := load_checkpoint(args.run_dir) if args.run_dir else None:
-        if checkpoint.get("script") != SCRIPT:
-            sys.exit(f"{args.run_dir} holds no run of {SCRIPT}.py but another's: choose another --run-dir")
-        saved = checkpoint["args"] | {"run_dir": args.run_dir}
-        args = tyro.cli(Args, args=argv, default=Args(**saved))
-        for name in saved.keys() - {"max_timesteps", "device", "cudagraphs", "dataset"}:
-            if getattr(args, name) != saved[name]:
-                sys.exit(f"the run in {args.run_dir} has {name} {saved[name]}: keep that, or choose another --run-dir")
-    tasks = [f"{robot}-{kind}-v2" for robot in ROBOTS for kind in KINDS]
-    if args.env not in tasks and not (args.dataset and args.env in ROBOTS):
-        sys.exit(f"--env {args.env} is none of {', '.join(tasks)}; with --dataset also {', '.join(ROBOTS)}")
-    if (args.device == "cuda" or args.cudagraphs) and (args.device == "cpu" or not torch.cuda.is_available()):
-        sys.exit("--device cuda and --cudagraphs need a GPU: leave them out")
-    for name, value in asdict(args).items():
-        low, high = (0, 1) if name in ("discount", "tau") else (0 if type(value) is float or name == "seed" else 1, 1e9)
-        if type(value) in (int, float) and not low <= value <= high:
-            sys.exit(f"--{name.replace('_', '-')} is {value}, but must be from {low} to {high:g}")
-    return args
+def read_hdf5(path, widths):
+    """Arrays of an HDF5 file, float32 (N, width), for the widths given by name.
+
+    Exits with a sentence if one is missing, of another shape or not finite.
+    """
+    arrays = {}
+    try:
+        with h5py.File(path) as file:
+            for key, width in widths.items():
+                if key not in file:
+                    sys.exit(f"{path} has no '{key}'")
+                array = file[key][:]
+                if array.ndim == 1:
+                    array = array[:, None]
+                shape = (len(file["observations"]), width)
+                if array.shape != shape:
+                    sys.exit(f"{path}: '{key}' has shape {array.shape}, not {shape}")
+                with np.errstate(over="ignore"):  # beyond float32, numbers are infinite
+                    arrays[key] = array.astype(np.float32)
+                if not np.isfinite(arrays[key]).all():
+                    sys.exit(f"{path}: '{key}' holds NaN or infinite numbers")
+    except (KeyError, OSError, RuntimeError, TypeError, ValueError) as error:
+        sys.exit(
+            f"{path} is no HDF5 file in D4RL's format, or is damaged ({error}); if it "
+            "is a download of D4RL's, delete it to download it again"
+        )
+    return arrays
 
 
-def save_checkpoint(run_dir, checkpoint):
-    """Writes checkpoint.pt, args.json and evaluations.csv, all or none; the last checkpoint becomes previous.pt."""
-    table, content = io.StringIO(), io.BytesIO()
-    columns = dict.fromkeys(column for row in checkpoint["rows"] for column in row)
+def load_dataset(path, state_dim, action_dim, args):
+    """The transitions of an HDF5 file in D4RL's format, as in d4rl.qlearning_dataset.
+
+    Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]). The last row
+    gives none, nor does one with a timeout: its o[i + 1] is in the next episode.
+
+    Returns the transitions by name, float32 tensors (N, width), and the discounted
+    return of each episode (episodes,).
+    """
+    widths = {"observations": state_dim, "actions": action_dim}
+    widths |= {"rewards": 1, "terminals": 1, "timeouts": 1}
+    arrays = read_hdf5(path, widths)
+    timeouts = arrays.pop("timeouts")[:, 0] != 0
+    keep = np.flatnonzero(~timeouts[:-1])
+    if len(keep) < args.batch_size:
+        sys.exit(
+            f"{path} has {len(keep)} transitions, too few for --batch-size "
+            f"{args.batch_size}"
+        )
+    transitions = {key: array[keep] for key, array in arrays.items()}
+    transitions["next_observations"] = arrays["observations"][keep + 1]
+
+    ends = timeouts | (arrays["terminals"][:, 0] != 0)
+    rewards = arrays["rewards"][:, 0].astype(np.float64)
+    episodes = np.split(rewards, np.flatnonzero(ends[:-1]) + 1)
+    discounted_returns = np.array(
+        [episode @ args.discount ** np.arange(len(episode)) for episode in episodes]
+    )
+    dataset = {name: torch.from_numpy(array) for name, array in transitions.items()}
+    return dataset, discounted_returns
+
+
+def normalize_states(transitions):
+    """Normalizes the states in place; returns their mean and std, each (state_dim,)."""
+    states = transitions["observations"].double()
+    mean = states.mean(dim=0).float()
+    std = states.std(dim=0, correction=0).float() + 1e-3
+    transitions["observations"].sub_(mean).div_(std)
+    transitions["next_observations"].sub_(mean).div_(std)
+    return mean, std
+
+
+def sample_batch(dataset, batch_size):
+    """A batch of transitions, drawn uniformly and with replacement."""
+    rewards = dataset["rewards"]
+    indices = torch.randint(len(rewards), (batch_size,), device=rewards.device)
+    return {name: column[indices] for name, column in dataset.items()}
+
+
+# --------------------------------------------------------------------------------------
+# Run folder
+# --------------------------------------------------------------------------------------
+
+SCRIPT = Path(__file__).stem
+
+
+def write_file(path, content):
+    """Writes `content` (bytes) whole or not at all, even if the power fails."""
+    temporary = path.with_name(path.name + ".tmp")
+    with open(temporary, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+@contextlib.contextmanager
+def exit_if_unwritable():
+    """Exits with a sentence where the run folder can't be written."""
+    try:
+        yield
+    except OSError as error:
+        sys.exit(
+            f"the run folder can't be written ({error}): what was saved before is "
+            "intact; free some space, or choose another --run-dir"
+        )
+
+
+@exit_if_unwritable()
+def open_run_dir(args):
+    """Makes and locks the run folder; returns its path and the lock, to be kept open.
+
+    Exits with a sentence if it can't be written or another process trains in it.
+    """
+    dataset = Path(args.dataset).stem if args.dataset else args.env
+    started = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}"
+    name = f"{dataset}__{SCRIPT}__{args.seed}__{started}"
+    run_dir = Path(args.run_dir or f"runs/{name}")
+    run_dir.mkdir(parents=True, exist_ok=True)
+    lock = open(run_dir / "lock", "a")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends
+    except BlockingIOError:
+        sys.exit(f"{run_dir} is in use by another process")
+    return run_dir, lock
+
+
+@exit_if_unwritable()
+def start_log(run_dir, args, step):
+    """Writes the arguments; returns TensorBoard's writer, to continue after `step`."""
+    arguments = json.dumps(asdict(args), indent=2)
+    write_file(run_dir / "args.json", arguments.encode())
+    writer = SummaryWriter(run_dir, purge_step=step + 1)
+    writer.add_text("args", f"<pre>{arguments}</pre>", step)
+    return writer
+
+
+@exit_if_unwritable()
+def log(writer, step, prefix, numbers):
+    """Adds numbers, a dict by name, to TensorBoard's curves."""
+    for name, number in numbers.items():
+        writer.add_scalar(f"{prefix}/{name}", number, step)
+    writer.flush()
+
+
+@exit_if_unwritable()
+def save(run_dir, checkpoint):
+    """Writes checkpoint.pt and, from the evaluations in it, evaluations.csv."""
+    table = io.StringIO()
+    rows = checkpoint["evaluations"]
+    columns = rows[-1].keys() if rows else ["step"]
     writer = csv.DictWriter(table, columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(checkpoint["rows"])
-    torch.save(checkpoint, content)  # to memory: to a full disk it would raise no OSError
-    files = {"args.json": json.dumps(checkpoint["args"], indent=2).encode()}
-    files |= {"evaluations.csv": table.getvalue().encode(), "checkpoint.pt": content.getvalue()}
-    for name, content in files.items():
-        (run_dir / f"{name}.part").write_bytes(content)
-    if (run_dir / "checkpoint.pt").exists():
-        os.replace(run_dir / "checkpoint.pt", run_dir / "previous.pt")
-    for name in files:
-        os.replace(run_dir / f"{name}.part", run_dir / name)
+    writer.writerows(rows)
+    content = io.BytesIO()  # torch.save to a full disk would fail with a RuntimeError
+    torch.save(checkpoint, content)
+    write_file(run_dir / "evaluations.csv", table.getvalue().encode())
+    write_file(run_dir / "checkpoint.pt", content.getvalue())
 
 
 def load_checkpoint(run_dir):
-    """A folder's last checkpoint, on the CPU, or None. Runs nothing in it; exits with a sentence if it is damaged."""
-    for path in (Path(run_dir, "checkpoint.pt"), Path(run_dir, "previous.pt")):  # the second alone: stopped in saving
-        if path.exists():
-            with contextlib.suppress(Exception):
-                if zipfile.ZipFile(path).testzip() is None:  # the CRCs, which torch.load does not check
-                    return torch.load(path, map_location="cpu", weights_only=True)
-            sys.exit(f"{path} is damaged: delete it to go on from the checkpoint before it, previous.pt, if it is there")
+    """The checkpoint of a run folder on the CPU; None if there is none yet.
+
+    Runs no code that is in the file. Exits with a sentence if it can't be loaded.
+    """
+    path = Path(run_dir, "checkpoint.pt")
+    if not path.exists():
+        return None
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
+        reason = str(error).splitlines()[0]
+        sys.exit(f"{path} can't be loaded ({type(error).__name__}: {reason})")
+
+
+# --------------------------------------------------------------------------------------
+# Arguments
+# --------------------------------------------------------------------------------------
+
+LIMITS = {
+    "seed": (0, 1_000_000),
+    "max_timesteps": (1, 1_000_000_000),
+    "eval_freq": (1, 1_000_000_000),
+    "eval_episodes": (1, 1_000),
+    "log_freq": (1, 1_000_000_000),
+    "batch_size": (1, 1_000_000_000),
+    "discount": (0, 1),
+    "tau": (0, 1),
+    "policy_noise": (0, 1_000),
+    "noise_clip": (0, 1_000),
+    "policy_freq": (1, 1_000_000_000),
+    "actor_lr": (0, 1_000_000),
+    "critic_lr": (0, 1_000_000),
+    "value_lr": (0, 1_000_000),
+}
+
+
+def check_args(args):
+    """Exits with a sentence if an argument is unknown, impossible or out of range."""
+    tasks = list(D4RL_SHA256)
+    if args.dataset is not None:
+        tasks += ENVIRONMENTS
+    if args.env not in tasks:
+        sys.exit(f"--env {args.env} is none of {', '.join(tasks)}")
+    if args.dataset is not None and not Path(args.dataset).is_file():
+        sys.exit(f"--dataset {args.dataset} is no file: name one in D4RL's HDF5 format")
+    if args.device == "cuda" and not torch.cuda.is_available():
+        sys.exit("--device cuda needs a GPU, and there is none: try --device cpu")
+    for name, (low, high) in LIMITS.items():
+        value = getattr(args, name)
+        if value is not None and not low <= value <= high:
+            flag = name.replace("_", "-")
+            sys.exit(f"--{flag} is {value}, but must be from {low} to {high}")
+
+
+def parse_args():
+    """The arguments on the command line; a run that is continued keeps its own."""
+    args = tyro.cli(Args, description=__doc__)
+    path = Path(args.run_dir or "", "args.json")
+    if args.run_dir and path.exists():
+        try:
+            saved = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            sys.exit(f"{path} can't be read ({error}): choose another --run-dir")
+        if saved.keys() != asdict(args).keys():
+            sys.exit(
+                f"{path} is of another script, or another version of {SCRIPT}.py: "
+                "continue the run with that, or choose another --run-dir"
+            )
+        args = tyro.cli(Args, default=Args(**saved), description=__doc__)
+        for name in saved.keys() - {"max_timesteps", "dataset", "device", "run_dir"}:
+            if getattr(args, name) != saved[name]:
+                sys.exit(
+                    f"the run in {args.run_dir} has {name} = {saved[name]}: "
+                    "keep it, or choose another --run-dir"
+                )
+    check_args(args)
+    if args.dataset:
+        args.dataset = str(Path(args.dataset).absolute())
+    return args
+
+
+# --------------------------------------------------------------------------------------
+# Training
+# --------------------------------------------------------------------------------------
+
+
+def check_finite(agent, metrics, step):
+    """Exits if a metric or a parameter is NaN or infinite; nothing is overwritten."""
+    tensors = [*metrics.values(), *agent.parameters()]
+    if not all(tensor.isfinite().all() for tensor in tensors):
+        sys.exit(
+            f"diverged by step {step}: the losses or the networks are no longer "
+            "finite; the last checkpoint is kept"
+        )
+
+
+def warn_if_q_runs_away(step, q, best_discounted_return):
+    """Whether Q is far above what the dataset shows to be possible: if so, says it."""
+    runs_away = q > 2 * abs(best_discounted_return)
+    if runs_away:
+        tqdm.write(
+            f"step {step:,}: Q is {q:.0f}, over twice the dataset's best discounted "
+            f"return of {best_discounted_return:.0f}: the constraint may be too weak"
+        )
+    return runs_away
+
+
+def catch_stop_signals():
+    """A list that SIGINT (Ctrl-C) and SIGTERM are added to, instead of stopping us."""
+    stop_signals = []
+
+    def request_stop(signal_number, frame):
+        stop_signals.append(signal_number)
+        signal.signal(signal_number, signal.SIG_DFL)  # a second one acts at once
+
+    signal.signal(signal.SIGINT, request_stop)
+    signal.signal(signal.SIGTERM, request_stop)
+    return stop_signals
 
 
 def train(args):
-    """Runs Algorithm 1 with evaluations, logs and checkpoints, from the start or from where --run-dir stopped."""
-    warnings.filterwarnings("ignore", ".*(out of date|capturable)")  # Gymnasium's on -v4, Adam's outside of CUDA graphs
-    env_id, low, high = ROBOTS[args.env.split("-")[0]]
-    envs = gym.make_vec(env_id, args.eval_episodes, vectorization_mode="sync")
-    obs_dim, action_dim = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
-    device = torch.device("cuda" if args.device != "cpu" and torch.cuda.is_available() else "cpu")
-    networks, optimizers = make_networks(obs_dim, action_dim, args, device)
-    path = dataset_path(args)
-    transitions, mean, std, widths, returns, best_return = load_dataset(path, obs_dim, action_dim, args)
-    sha256 = hashlib.sha256(transitions.numpy()).hexdigest()
-    name = f"{path.stem if args.dataset else args.env}__{SCRIPT}__{args.seed}"
-    run_dir = Path(args.run_dir or f"runs/{name}__{time.strftime('%Y-%m-%d_%H-%M-%S')}_{os.getpid()}")
-    run_dir.mkdir(parents=True, exist_ok=True)
-    lock = open(run_dir / "lock", "w")
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until this process ends, however it does
-    except BlockingIOError:
-        sys.exit(f"{run_dir} is in use by another process")
-    rng = torch.Generator(device).manual_seed(args.seed)  # of batches and noise, whatever the networks drew
-    start, rows, history = 0, [], {}  # history: the metrics of each step since they were logged
-    if checkpoint := load_checkpoint(run_dir):
-        if checkpoint["sha256"] != sha256:
-            sys.exit(f"the run in {run_dir} is on other data than {path}: choose another --run-dir")
-        start, rows = checkpoint["step"], checkpoint["rows"]
-        for kind, parts in (("networks", networks), ("optimizers", optimizers)):
-            for name, part in parts.items():
-                part.load_state_dict(checkpoint[kind][name])
-        history = {name: list(values.to(device)) for name, values in checkpoint["history"].items()}
-        if checkpoint["device"] == device.type:  # else the state does not fit
-            rng.set_state(checkpoint["rng"])
+    """Trains from the start, or continues the run that is in the run folder."""
+    envs = make_envs(args.env, args.eval_episodes)
+    state_dim = envs.single_observation_space.shape[0]
+    action_dim = envs.single_action_space.shape[0]
+    max_action = float(envs.single_action_space.high[0])
 
-    scores = 100 * (returns - low) / (high - low)
-    print(f"task     {args.env}, evaluated in {env_id}; seed {args.seed}")
-    print(f"dataset  {path}: {len(transitions):,} transitions of {len(scores):,} episodes")
-    print(f"         score {scores.mean():.1f}, at best {scores.max():.1f}; best discounted return {best_return:.1f}")
-    print(f"run      {run_dir}, from step {start:,} on; {device} with {torch.get_num_threads()} threads")
-    transitions, stopped = transitions.to(device), []
-    for number in (signal.SIGINT, signal.SIGTERM):  # heard between two steps; a second one acts at once
-        signal.signal(number, lambda number, _: (stopped.append(number), signal.signal(number, signal.SIG_DFL)))
+    path = args.dataset or download_dataset(args.env)
+    dataset, discounted_returns = load_dataset(path, state_dim, action_dim, args)
+    best_return = discounted_returns.max()
+    mean, std = torch.zeros(state_dim), torch.ones(state_dim)
+    if args.normalize:
+        mean, std = normalize_states(dataset)
+    mean, std = mean.to(args.device), std.to(args.device)
+    dataset = {name: column.to(args.device) for name, column in dataset.items()}
 
-    def train_step(step):
-        i = torch.randint(len(transitions), (args.batch_size,), generator=rng, device=device)
-        return update(networks, optimizers, transitions[i].split(widths, dim=1), args, step, rng)
-    graphs, results, metrics, warned, clock, clock_step = {}, {}, {}, False, time.perf_counter(), start
-    writer = SummaryWriter(run_dir, purge_step=start + 1 if checkpoint else 0)
-    with writer, tqdm(desc=SCRIPT, initial=start, total=args.max_timesteps, unit="step", disable=None) as progress:
-        for step in range(start, args.max_timesteps + 1):
-            if step > start:
-                kind = step % args.policy_freq == 0  # with the policy's update or without it
-                if args.cudagraphs and kind not in graphs and step > start + 2 * args.policy_freq:  # Adam is set up
-                    graphs[kind] = torch.cuda.CUDAGraph()
-                    graphs[kind].register_generator_state(rng)
-                    with torch.cuda.graph(graphs[kind]):  # records the step and runs nothing
-                        results[kind] = train_step(step)
-                if kind in graphs:
-                    graphs[kind].replay()
-                else:
-                    results[kind] = train_step(step)
-                for name, metric in results[kind].items():
-                    history.setdefault(name, []).append(metric.clone())  # the next replay overwrites it
-                progress.update()
-            due = (step % args.eval_freq == 0 or step == args.max_timesteps) and (not rows or rows[-1]["step"] < step)
-            if history and (due or step % args.log_freq == 0):
-                metrics = {name: torch.stack(values).mean().item() for name, values in history.items()}
-                history.clear()
-                speed = (step - clock_step) / (time.perf_counter() - clock)
-                metrics |= {"best_discounted_return": best_return, "steps_per_second": speed}
+    torch.manual_seed(args.seed)
+    agent = Agent(state_dim, action_dim, max_action, args).to(args.device)
+    torch.manual_seed(args.seed)  # again: the batches depend on no network
+
+    run_dir, _lock = open_run_dir(args)
+    step, metrics, evaluations = 0, {}, []
+    sha256 = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    checkpoint = load_checkpoint(run_dir)
+    if checkpoint is not None:
+        if checkpoint["dataset_sha256"] != sha256:
+            sys.exit(f"{path} is not the dataset of the run in {run_dir}: name that")
+        agent.load_state_dict(checkpoint["networks"])
+        states = checkpoint["optimizers"]
+        for optimizer, state in zip(agent.optimizers, states, strict=True):
+            optimizer.load_state_dict(state)
+        step = checkpoint["step"]
+        metrics = checkpoint["metrics"]
+        evaluations = checkpoint["evaluations"]
+        torch.set_rng_state(checkpoint["rng_state"])
+        torch.cuda.set_rng_state_all(checkpoint["cuda_rng_states"])
+
+    def save_checkpoint():
+        check_finite(agent, metrics, step)
+        checkpoint = {
+            "networks": agent.state_dict(),
+            "optimizers": [optimizer.state_dict() for optimizer in agent.optimizers],
+            "step": step,
+            "metrics": metrics,
+            "evaluations": evaluations,
+            "rng_state": torch.get_rng_state(),
+            "cuda_rng_states": torch.cuda.get_rng_state_all(),
+            "mean": mean,
+            "std": std,
+            "dataset_sha256": sha256,
+        }
+        save(run_dir, checkpoint)
+
+    num_transitions, num_episodes = len(dataset["rewards"]), len(discounted_returns)
+    print(f"dataset  {path}")
+    print(f"         {num_transitions:,} transitions in {num_episodes:,} episodes")
+    print(f"run      {run_dir}, from step {step:,}, on {args.device}")
+    writer = start_log(run_dir, args, step)
+    stop_signals = catch_stop_signals()
+    warned = False
+    clock, clock_step = time.perf_counter(), step
+    with tqdm(initial=step, total=args.max_timesteps, disable=None) as progress:
+        while step < args.max_timesteps and not stop_signals:
+            step += 1
+            batch = sample_batch(dataset, args.batch_size)
+            metrics |= agent.update(batch, step)
+            progress.update()
+
+            eval_is_due = step % args.eval_freq == 0 or step == args.max_timesteps
+            if eval_is_due or step % args.log_freq == 0:
+                check_finite(agent, metrics, step)
+                numbers = {name: metric.item() for name, metric in metrics.items()}
+                seconds = time.perf_counter() - clock
+                numbers["steps_per_second"] = (step - clock_step) / seconds
+                log(writer, step, "train", numbers)
+                if not warned:
+                    warned = warn_if_q_runs_away(step, numbers["q"], best_return)
                 clock, clock_step = time.perf_counter(), step
-                for name, metric in metrics.items():
-                    writer.add_scalar(f"train/{name}", metric, step)
-                shown = {"score": rows[-1]["score"]} | metrics
-                progress.set_postfix({name: f"{shown[name]:.3g}" for name in ("score", "q", "weight") if name in shown})
-                if metrics["target_q"] > 2 * abs(best_return) and not warned:
-                    warned = True
-                    progress.write(f"step {step:,}: Q is over twice the data's best discounted return: the weights may be off")
-            if due or stopped or step % args.log_freq == 0:
-                sums = {name: sum(x.detach().sum() for x in network.parameters()) for name, network in networks.items()}
-                if bad := [name for name, value in (metrics | sums).items() if not np.isfinite(float(value))]:
-                    sys.exit(f"diverged by step {step}: not finite are {', '.join(bad)}; the last checkpoint is kept")
-            if due:
-                returns = evaluate(envs, networks["actor"], mean, std, args.seed)
-                scores = 100 * (returns - low) / (high - low)
-                row = {"step": step, "score": scores.mean().item(), "score_std": scores.std().item()}
-                rows.append(row | {"returns": " ".join(f"{x:.2f}" for x in returns)} | metrics)
-                writer.add_scalar("eval/score", row["score"], step)
-                progress.write(f"step {step:>9,}  score {row['score']:6.2f} +- {row['score_std']:5.2f}")
+            if eval_is_due:
+                returns = evaluate(envs, agent.actor, mean, std, args.seed)
+                scores = normalized_score(returns, args.env)
+                score = scores.mean().item()
+                row = {"step": step, "normalized_score": score}
+                row["std_over_episodes"] = scores.std().item()
+                row["returns"] = " ".join(f"{x:.2f}" for x in returns)
+                evaluations.append(row | numbers)
+                log(writer, step, "eval", {"normalized_score": score})
+                tqdm.write(f"step {step:,}: normalized score {score:.2f}")
+                save_checkpoint()
                 clock = time.perf_counter()
-            if due or stopped:
-                checkpoint = {"script": SCRIPT, "args": asdict(args), "sha256": sha256, "step": step, "rows": rows}
-                checkpoint |= {"mean": mean, "std": std, "device": device.type, "rng": rng.get_state()}
-                checkpoint["history"] = {name: torch.stack(values) for name, values in history.items()}
-                checkpoint["networks"] = {name: network.state_dict() for name, network in networks.items()}
-                checkpoint["optimizers"] = {name: optimizer.state_dict() for name, optimizer in optimizers.items()}
-                writer.flush()
-                save_checkpoint(run_dir, checkpoint)
-            if stopped:
-                progress.write(f"stopped at step {step:,}; to go on: python {SCRIPT}.py --run-dir {run_dir}")
-                sys.exit(128 + stopped[0])
-    last = [row["score"] for row in rows[-10:]]
-    print(f"finished step {rows[-1]['step']:,}: score {last[-1]:.2f}, mean of the last {len(last)} {np.mean(last):.2f}")
-    print(f"files    {run_dir}/: evaluations.csv, checkpoint.pt, args.json, TensorBoard's events")
+
+    if stop_signals:
+        save_checkpoint()
+        print(f"stopped at step {step:,}; to continue:")
+        print(f"    python {SCRIPT}.py --run-dir {run_dir}")
+        sys.exit(128 + stop_signals[0])
+    print(f"finished at step {step:,}: see {run_dir}/evaluations.csv")
 
 
-if __name__ == "__main__":
-    sys.stdout.reconfigure(line_buffering=True)  # a log file is up to date, however the run ends
-    threading.excepthook = lambda _: None  # TensorBoard's writer: its error comes up again in flush()
+def hide_write_errors(failure):
+    """Prints no traceback where TensorBoard's thread can't write: `log` tells of it."""
+    if not issubclass(failure.exc_type, OSError):
+        threading.__excepthook__(failure)
+
+
+def main():
+    sys.stdout.reconfigure(line_buffering=True)  # a log file is always up to date
+    threading.excepthook = hide_write_errors
+    torch.set_flush_denormal(True)  # a CPU takes far longer for numbers below 1e-38
     try:
         train(parse_args())
     except KeyboardInterrupt:
         sys.exit("interrupted before the first step")
-    except OSError as error:  # a full disk, a read-only folder
-        sys.exit(f"{error}: what was saved before is intact")
+    except (MemoryError, RuntimeError) as error:
+        # On a GPU PyTorch raises OutOfMemoryError, on a CPU only its text tells.
+        memory_errors = (MemoryError, torch.OutOfMemoryError)
+        if not isinstance(error, memory_errors) and "can't allocate" not in str(error):
+            raise
+        sys.exit("out of memory: try a smaller --batch-size, or a smaller dataset")
+
+
+if __name__ == "__main__":
+    main()

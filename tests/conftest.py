@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""What the tests share: the three scripts as modules, a writer of small D4RL-format files, and runs as subprocesses."""
+"""What tests share: the scripts as modules, small datasets, and runs in processes."""
 
+import csv
 import os
+import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 ROOT = Path(__file__).parents[1]
 DATASET = ROOT / "tests/data/halfcheetah_replay.hdf5"
@@ -28,16 +32,18 @@ def script(request):
     return SCRIPTS[request.param]
 
 
-def d4rl_arrays(rows, obs_dim=17, action_dim=6, seed=0):
-    """A dataset in D4RL's layout: random numbers, an episode's end every 10 rows, by turns terminal and timeout."""
+def d4rl_arrays(rows, state_dim=17, action_dim=6, seed=0):
+    """Random data in D4RL's layout: every tenth row ends an episode, by turns as a
+    terminal and as a timeout."""
     rng = np.random.default_rng(seed)
     end = np.arange(rows) % 10 == 9
+    is_terminal = np.arange(rows) // 10 % 2 == 0
     return {
-        "observations": rng.normal(size=(rows, obs_dim)).astype(np.float32),
+        "observations": rng.normal(size=(rows, state_dim)).astype(np.float32),
         "actions": rng.uniform(-1, 1, (rows, action_dim)).astype(np.float32),
         "rewards": rng.normal(size=rows).astype(np.float32),
-        "terminals": end & (np.arange(rows) // 10 % 2 == 0),
-        "timeouts": end & (np.arange(rows) // 10 % 2 == 1),
+        "terminals": end & is_terminal,
+        "timeouts": end & ~is_terminal,
     }
 
 
@@ -49,12 +55,99 @@ def write_hdf5(path, arrays):
 
 
 def command(script, *arguments):
-    """The command line of a short run on the shipped dataset; later arguments override these."""
-    short = "--env halfcheetah --max-timesteps 300 --eval-freq 100 --eval-episodes 2 --log-freq 50 --device cpu".split()
-    return [sys.executable, str(ROOT / f"{script}.py"), *short, "--dataset", str(DATASET), *map(str, arguments)]
+    """A short run on the dataset that ships; later arguments override these."""
+    line = [sys.executable, ROOT / f"{script}.py", "--env", "halfcheetah"]
+    line += ["--dataset", DATASET, "--device", "cpu", "--max-timesteps", 60]
+    line += ["--eval-freq", 30, "--eval-episodes", 2, "--log-freq", 10, *arguments]
+    return [str(x) for x in line]
+
+
+def environment():
+    return os.environ | {"OMP_NUM_THREADS": "1"}  # two runs agree to the last bit
 
 
 def run(*line, **options):
-    """The finished process of a command line, single-threaded, so that two runs agree to the last bit."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    return subprocess.run(line, capture_output=True, text=True, env=environment, timeout=300, **options)
+    """The finished process of a command line."""
+    line = [str(x) for x in line]
+    return subprocess.run(
+        line, capture_output=True, text=True, env=environment(), timeout=600, **options
+    )
+
+
+def start(*line, **options):
+    """The running process of a command line."""
+    pipe = subprocess.PIPE
+    return subprocess.Popen(
+        [str(x) for x in line],
+        stdout=pipe,
+        stderr=pipe,
+        text=True,
+        env=environment(),
+        **options,
+    )
+
+
+def wait_until(condition, process):
+    """Waits for a condition while a process runs."""
+    end = time.time() + 600
+    while not condition():
+        assert process.poll() is None and time.time() < end, process.communicate()
+        time.sleep(0.01)
+
+
+def assert_one_sentence(process, sentence, code=1):
+    """The process ended with this in one line on stderr, and nothing else there."""
+    assert sentence in process.stderr, process.stderr
+    assert "Traceback" not in process.stderr and process.stderr.count("\n") == 1
+    assert process.returncode == code
+
+
+def read_rows(run_dir):
+    """The rows of evaluations.csv, without the speed, which never repeats."""
+    rows = list(csv.DictReader((run_dir / "evaluations.csv").open()))
+    for row in rows:
+        row.pop("steps_per_second", None)
+    return rows
+
+
+def read_curves(run_dir):
+    """TensorBoard's scalars but the speed: {tag: [(step, value), ...]}."""
+    events = EventAccumulator(str(run_dir), size_guidance={"scalars": 0}).Reload()
+    tags = [tag for tag in events.Tags()["scalars"] if "steps_per_second" not in tag]
+    return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in tags}
+
+
+def load(run_dir):
+    return torch.load(run_dir / "checkpoint.pt", weights_only=True)
+
+
+def as_bits(value):
+    """A checkpoint with its tensors as bytes, which compare to the last bit."""
+    if isinstance(value, dict):
+        items = value.items()
+        return {key: as_bits(v) for key, v in items if key != "steps_per_second"}
+    if isinstance(value, list | tuple):
+        return [as_bits(v) for v in value]
+    if isinstance(value, torch.Tensor):
+        return value.numpy().tobytes()
+    return value
+
+
+def result(run_dir):
+    """All that a run leaves, in a form that compares to the last bit."""
+    return as_bits(load(run_dir)), read_rows(run_dir), read_curves(run_dir)
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory):
+    """The folder of a run of wpc.py that nothing disturbed."""
+    run_dir = tmp_path_factory.mktemp("finished") / "run"
+    process = run(*command("wpc", "--run-dir", run_dir))
+    assert process.returncode == 0, process.stderr
+    return run_dir
+
+
+@pytest.fixture
+def run_dir(finished, tmp_path):
+    """A copy of that folder."""
+    return shutil.copytree(finished, tmp_path / "run")

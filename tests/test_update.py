@@ -1,49 +1,77 @@
 # SPDX-License-Identifier: MIT
-"""`update`, Algorithm 1's step, against NumPy in float64, and against the identities between the three scripts."""
-
-import copy
+"""`Agent.update`, a step of Algorithm 1: against NumPy in float64, and against the
+identities between the three scripts."""
 
 import numpy as np
 import pytest
 import torch
 from conftest import SCRIPTS, td3_bc, wbc, wpc
 
-OBS, ACT, BATCH = 5, 3, 64
-# nothing at its default, the noise clipped about half the time
-OPTIONS = dict(discount=0.9, tau=0.1, policy_noise=0.3, noise_clip=0.25, policy_lr=1e-3, q_lr=1e-4, seed=3)
-CASES = [("td3_bc", {"alpha": 1.7}), ("wbc", {"v_lr": 2e-4})]
-CASES += [("wpc", {"alpha": 1.7, "v_lr": 2e-4, "weight": w, "beta": 0.02}) for w in ("binary", "exponential", "random", "static")]
+STATE_DIM, ACTION_DIM, MAX_ACTION, BATCH = 5, 3, 1.5, 64
+
+# Nothing at its default, and the noise clipped about half the time.
+OPTIONS = {
+    "discount": 0.9,
+    "tau": 0.1,
+    "policy_noise": 0.3,
+    "noise_clip": 0.25,
+    "actor_lr": 1e-3,
+    "critic_lr": 1e-4,
+}
+WEIGHTS = ["binary", "exponential", "random", "static"]
+CASES = [("td3_bc", {"alpha": 1.7}), ("wbc", {"value_lr": 2e-4})]
+for kind in WEIGHTS:
+    options = {"alpha": 1.7, "value_lr": 2e-4, "weight": kind, "beta": 0.02}
+    CASES.append(("wpc", options))
 
 
-def make(name, options):
-    """A script's arguments, float64 networks, optimizers and a batch, with Q below zero and V in its midst."""
-    script = SCRIPTS[name]
-    args = script.Args(**OPTIONS | options)
-    networks, optimizers = script.make_networks(OBS, ACT, args, "cpu")
-    for network in networks.values():
-        network.double()
-    with torch.no_grad():  # targets unlike the networks; Q < 0, where mean |Q| is not mean Q
-        rng = torch.Generator().manual_seed(1)
-        for name in ("actor_target", "critic_target"):
-            for p in networks[name].parameters():
-                p.add_(0.05 * torch.randn(p.shape, generator=rng))
-        networks["actor_target"][4].weight *= 30  # saturated: noise leads beyond the largest action
-        for q in networks["critic"]:
-            q[4].bias -= 0.5
-    rng = torch.Generator().manual_seed(2)
-    s, s_next = (torch.randn(BATCH, OBS, generator=rng).double() for _ in range(2))
-    a = torch.rand(BATCH, ACT, generator=rng).double() * 2 - 1
-    r = torch.randn(BATCH, 1, generator=rng).double()
-    not_done, half = (torch.rand(2, BATCH, 1, generator=rng) < 0.6).double()
-    if "value" in networks:
-        with torch.no_grad():
-            networks["value"][4].bias += (networks["critic"][0](torch.cat([s, a], 1)) - networks["value"](s)).median()
-    return script, args, networks, optimizers, (s, a, r, not_done, s_next, half)[: 6 if script is wpc else 5]
+def make_agent(script, **options):
+    """An agent in float64. Its targets differ from its networks, its Q is below zero,
+    where mean |Q| is not mean Q, and its target policy is at the edge, where noise
+    leads over it."""
+    torch.manual_seed(3)
+    args = script.Args(**options)
+    agent = script.Agent(STATE_DIM, ACTION_DIM, MAX_ACTION, args).double()
+    with torch.no_grad():
+        for target in (agent.actor_target, agent.critic_target):
+            for parameter in target.parameters():
+                parameter += 0.05 * torch.randn_like(parameter)
+        agent.actor_target.net[4].weight *= 30
+        agent.critic.q1_net[4].bias -= 0.5
+        agent.critic.q2_net[4].bias -= 0.5
+    return agent
 
 
-def arrays(networks):
-    """Each network as a list of NumPy arrays: weight, bias, weight, bias, ..."""
-    return {name: [p.detach().numpy().copy() for p in n.parameters()] for name, n in networks.items()}
+def make_batch():
+    torch.manual_seed(4)
+    flags = (torch.rand(2, BATCH, 1) < 0.4).double()
+    return {
+        "observations": torch.randn(BATCH, STATE_DIM, dtype=torch.float64),
+        "actions": MAX_ACTION * (2 * torch.rand(BATCH, ACTION_DIM).double() - 1),
+        "rewards": torch.randn(BATCH, 1, dtype=torch.float64),
+        "next_observations": torch.randn(BATCH, STATE_DIM, dtype=torch.float64),
+        "terminals": flags[0],
+        "better_half": flags[1],
+    }
+
+
+def center_value(agent, batch):
+    """Moves V into the midst of Q, so that about half of the weights are 1."""
+    s, a = batch["observations"], batch["actions"]
+    with torch.no_grad():
+        agent.value.net[4].bias += (agent.critic.q1(s, a) - agent.value(s)).median()
+
+
+# The same step in NumPy, where a network is a list: weight, bias, weight, bias, ...
+
+
+def numpy_networks(agent):
+    networks = dict(agent.named_children())
+    return {name: numpy_parameters(network) for name, network in networks.items()}
+
+
+def numpy_parameters(network):
+    return [parameter.detach().numpy().copy() for parameter in network.parameters()]
 
 
 def mlp(p, x):
@@ -52,206 +80,290 @@ def mlp(p, x):
     return x @ p[4].T + p[5]
 
 
+def policy(p, s):
+    return MAX_ACTION * np.tanh(mlp(p, s))
+
+
 def q_values(p, s, a):
-    x = np.concatenate([s, a], 1)
-    return mlp(p[:6], x), mlp(p[6:], x)
+    sa = np.concatenate([s, a], axis=1)
+    return mlp(p[:6], sa), mlp(p[6:], sa)
 
 
-def critic_losses(p, batch, args, noise):
-    """y, Q1, V and both losses, as in Algorithm 1, from the parameters before the step."""
-    s, a, r, not_done, s_next = batch[:5]
+def target(networks, batch, args, noise):
+    """y of Algorithm 1, from standard normal noise."""
     noise = np.clip(args.policy_noise * noise, -args.noise_clip, args.noise_clip)
-    a_next = np.clip(np.tanh(mlp(p["actor_target"], s_next)) + noise, -1, 1)
-    y = r + args.discount * not_done * np.minimum(*q_values(p["critic_target"], s_next, a_next))
-    q1, q2 = q_values(p["critic"], s, a)
-    values = {"target_q": y.mean(), "q": q1.mean(), "critic_loss": ((q1 - y) ** 2).mean() + ((q2 - y) ** 2).mean()}
-    if "value" in p:
-        v = mlp(p["value"], s)
-        values |= {"v": v.mean(), "v_loss": ((v - y) ** 2).mean()}
-    return values
+    s_next = batch["next_observations"]
+    a_next = policy(networks["actor_target"], s_next) + MAX_ACTION * noise
+    a_next = np.clip(a_next, -MAX_ACTION, MAX_ACTION)
+    q_next = np.minimum(*q_values(networks["critic_target"], s_next, a_next))
+    return batch["rewards"] + args.discount * (1 - batch["terminals"]) * q_next
 
 
-def actor_losses(p, batch, args, weight, lmbda=None):
-    """lambda and the actor's loss, with a given weight; lambda is a constant to the gradient."""
-    s, a = batch[:2]
-    pi = np.tanh(mlp(p["actor"], s))
-    values = {"action_distance": np.abs(pi - a).mean(), "actor_loss": (weight * (pi - a) ** 2).mean()}
-    if hasattr(args, "alpha"):
-        q = q_values(p["critic"], s, pi)[0]
-        values["lmbda"] = args.alpha / np.abs(q).mean() if lmbda is None else lmbda
-        values["actor_loss"] -= values["lmbda"] * q.mean()
-    return values
+def critic_loss(networks, batch, y):
+    q1, q2 = q_values(networks["critic"], batch["observations"], batch["actions"])
+    return ((q1 - y) ** 2).mean() + ((q2 - y) ** 2).mean()
 
 
-def assert_gradient(loss, parameters, gradients):
-    """Central differences at some entries of every parameter, the steepest among them."""
-    for parameter, gradient in zip(parameters, gradients):
-        flat, g = parameter.reshape(-1), gradient.numpy().reshape(-1)
-        for i in {int(np.abs(g).argmax()), *np.random.default_rng(0).integers(len(flat), size=3).tolist()}:
-            values, original = [], flat[i]
-            for step in (1e-6, -1e-6):
-                flat[i] = original + step
-                values.append(loss())
+def value_loss(networks, batch, y):
+    return ((mlp(networks["value"], batch["observations"]) - y) ** 2).mean()
+
+
+def advantage(networks, batch):
+    s, a = batch["observations"], batch["actions"]
+    return q_values(networks["critic"], s, a)[0] - mlp(networks["value"], s)
+
+
+def weight(kind, advantage, batch, permutation):
+    """Equations 7 and 8, wPC-rnd and the static weight."""
+    binary = (advantage > 0).astype(float)
+    weights = {
+        "binary": binary,
+        "exponential": np.minimum(np.exp(advantage / 0.02), 100),
+        "random": binary[permutation],
+        "static": batch["better_half"],
+    }
+    return weights[kind]
+
+
+def lmbda(networks, batch, alpha):
+    s = batch["observations"]
+    q = q_values(networks["critic"], s, policy(networks["actor"], s))[0]
+    return alpha / np.abs(q).mean()
+
+
+def actor_loss(networks, batch, weight, lmbda):
+    """The negative of equation 6; lambda is a constant to the gradient."""
+    s, a = batch["observations"], batch["actions"]
+    pi = policy(networks["actor"], s)
+    q = q_values(networks["critic"], s, pi)[0]
+    return -lmbda * q.mean() + (weight * (pi - a) ** 2).mean()
+
+
+def assert_gradient(loss, parameters, network):
+    """Gradients are central differences of the loss, at the steepest and at three more
+    entries of each parameter."""
+    for parameter, tensor in zip(parameters, network.parameters(), strict=True):
+        flat, gradient = parameter.reshape(-1), tensor.grad.numpy().reshape(-1)
+        entries = np.random.default_rng(0).integers(len(flat), size=3)
+        for i in {int(np.abs(gradient).argmax()), *entries.tolist()}:
+            original = flat[i]
+            flat[i] = original + 1e-6
+            above = loss()
+            flat[i] = original - 1e-6
+            below = loss()
             flat[i] = original
-            assert (values[0] - values[1]) / 2e-6 == pytest.approx(g[i], rel=1e-4, abs=1e-7)
+            slope = (above - below) / 2e-6
+            assert slope == pytest.approx(gradient[i], rel=1e-4, abs=1e-7)
+
+
+def assert_adam_step(before, after, network, learning_rate):
+    """Adam's first step is lr * sign(gradient)."""
+    for old, new, tensor in zip(before, after, network.parameters(), strict=True):
+        gradient = tensor.grad.numpy()
+        sure = np.abs(gradient) > 1e-5
+        expected = -learning_rate * np.sign(gradient)[sure]
+        assert (new - old)[sure] == pytest.approx(expected, rel=1e-2)
 
 
 @pytest.mark.parametrize("name, options", CASES)
-def test_update_agrees_with_numpy(name, options):
-    script, args, networks, optimizers, batch = make(name, options)
-    before, rng = arrays(networks), torch.Generator().manual_seed(7)
-    noise = torch.randn(BATCH, ACT, generator=torch.Generator().manual_seed(7)).double().numpy()
-    np_batch = [x.numpy() for x in batch]
-    metrics = {k: v.item() for k, v in script.update(networks, optimizers, batch, args, 2, rng).items()}
-    after = arrays(networks)
+def test_a_step_agrees_with_numpy(name, options):
+    agent = make_agent(SCRIPTS[name], **OPTIONS, **options)
+    batch, has_value = make_batch(), name != "td3_bc"
+    if has_value:
+        center_value(agent, batch)
+    before, arrays = numpy_networks(agent), {k: x.numpy() for k, x in batch.items()}
 
-    expected = critic_losses(before, np_batch, args, noise)
-    learning = {"critic": "critic_loss", "value": "v_loss"} if name != "td3_bc" else {"critic": "critic_loss"}
-    for network, loss in learning.items():
-        gradients = [p.grad for p in networks[network].parameters()]
-        assert_gradient(lambda: critic_losses(before, np_batch, args, noise)[loss], before[network], gradients)
+    torch.manual_seed(7)
+    noise = torch.randn(BATCH, ACTION_DIM, dtype=torch.float64).numpy()
+    permutation = torch.randperm(BATCH).numpy()
+    torch.manual_seed(7)
+    metrics = {key: x.item() for key, x in agent.update(batch, step=2).items()}
+    after = numpy_networks(agent)
 
-    # the policy's part, with critics and V as this step left them and the actor as it was
-    mixed = after | {"actor": before["actor"]}
-    weight = np.ones((BATCH, 1))
-    if name != "td3_bc":
-        advantage = q_values(after["critic"], *np_batch[:2])[0] - mlp(after["value"], np_batch[0])
-        weight = (advantage > 0).astype(float)
-        assert 0.2 < weight.mean() < 0.8  # a case that can tell
-        lagging = q_values(before["critic"], *np_batch[:2])[0] - mlp(before["value"], np_batch[0])
-        assert ((lagging > 0) != (advantage > 0)).any()  # so can the networks' age
-        shuffled = torch.Generator().manual_seed(7)
-        torch.randn(BATCH, ACT, generator=shuffled)
-        order = torch.rand(BATCH, generator=shuffled).argsort().numpy()
-        weight = {
-            "binary": weight,
-            "exponential": np.minimum(np.exp(advantage / 0.02), 100),
-            "random": weight[order],
-            "static": np_batch[-1],
-        }[options.get("weight", "binary")]
-        expected["weight"] = (weight > 0).mean()
-    expected |= actor_losses(mixed, np_batch, args, weight)
+    # critics and value, from the networks before the step
+    y = target(before, arrays, agent.args, noise)
+    q1, _ = q_values(before["critic"], arrays["observations"], arrays["actions"])
+    expected = {"q": q1.mean(), "critic_loss": critic_loss(before, arrays, y)}
+    if has_value:
+        expected["v"] = mlp(before["value"], arrays["observations"]).mean()
+        expected["value_loss"] = value_loss(before, arrays, y)
+        loss = lambda: value_loss(before, arrays, y)  # noqa: E731
+        assert_gradient(loss, before["value"], agent.value)
+        assert_adam_step(before["value"], after["value"], agent.value, 2e-4)
+
+    # the policy, from critics and value after the step
+    networks = after | {"actor": before["actor"]}
+    w = np.ones((BATCH, 1))
+    if has_value:
+        old, new = advantage(before, arrays), advantage(after, arrays)
+        assert 0.2 < (new > 0).mean() < 0.8  # these cases can tell one weight from
+        assert ((old > 0) != (new > 0)).any()  # another, and old networks from new
+        w = weight(options.get("weight", "binary"), new, arrays, permutation)
+        expected["weight"] = w.mean()
+    lam = 0.0
+    if "alpha" in options:
+        lam = expected["lmbda"] = lmbda(networks, arrays, options["alpha"])
+    expected["actor_loss"] = actor_loss(networks, arrays, w, lam)
+    loss = lambda: actor_loss(networks, arrays, w, lam)  # noqa: E731
+    assert_gradient(loss, networks["actor"], agent.actor)
+    assert_adam_step(before["actor"], after["actor"], agent.actor, 1e-3)
     assert metrics == pytest.approx(expected, rel=1e-6)
-    gradients = [p.grad for p in networks["actor"].parameters()]
-    loss = lambda: actor_losses(mixed, np_batch, args, weight, expected.get("lmbda"))["actor_loss"]  # noqa: E731
-    assert_gradient(loss, mixed["actor"], gradients)
 
-    rates = {"actor": args.policy_lr, "critic": args.q_lr, "value": getattr(args, "v_lr", None)}
-    for network in ("actor", *learning):  # Adam's first step is lr * sign(gradient)
-        for old, new, p in zip(before[network], after[network], networks[network].parameters()):
-            sure = np.abs(p.grad.numpy()) > 1e-5
-            assert (new - old)[sure] == pytest.approx(-rates[network] * np.sign(p.grad.numpy())[sure], rel=1e-2)
     for network in ("actor", "critic"):
-        for old, target, new in zip(before[f"{network}_target"], after[f"{network}_target"], after[network]):
-            assert target == pytest.approx((1 - args.tau) * old + args.tau * new, rel=1e-12)
+        pairs = zip(before[f"{network}_target"], after[network], strict=True)
+        moved = [0.9 * old + 0.1 * new for old, new in pairs]
+        for parameter, there in zip(after[f"{network}_target"], moved, strict=True):
+            assert parameter == pytest.approx(there, rel=1e-12)
 
 
-@pytest.mark.parametrize("policy_freq, step, moves", [(2, 1, False), (2, 2, True), (3, 2, False), (3, 3, True), (1, 1, True)])
-def test_policy_and_targets_move_every_policy_freq_steps(script, policy_freq, step, moves):
-    _, args, networks, optimizers, batch = make(script.SCRIPT, {"policy_freq": policy_freq})
-    args.alpha = 2.5
-    before = arrays(networks)
-    metrics = script.update(networks, optimizers, batch, args, step, torch.Generator())
+def test_the_critics_gradient(script):
+    """On a step without the policy, whose loss reaches the critics' gradients too."""
+    agent, batch = make_agent(script, **OPTIONS), make_batch()
+    before, arrays = numpy_networks(agent), {k: x.numpy() for k, x in batch.items()}
+    torch.manual_seed(7)
+    noise = torch.randn(BATCH, ACTION_DIM, dtype=torch.float64).numpy()
+    torch.manual_seed(7)
+    agent.update(batch, step=1)
+    y = target(before, arrays, agent.args, noise)
+    loss = lambda: critic_loss(before, arrays, y)  # noqa: E731
+    assert_gradient(loss, before["critic"], agent.critic)
+    after = numpy_parameters(agent.critic)
+    assert_adam_step(before["critic"], after, agent.critic, 1e-4)
+
+
+STEPS = [(2, 1, False), (2, 2, True), (3, 2, False), (3, 3, True), (1, 1, True)]
+
+
+@pytest.mark.parametrize("policy_freq, step, moves", STEPS)
+def test_policy_and_targets_move_every_policy_freq_steps(
+    script, policy_freq, step, moves
+):
+    agent = make_agent(script, policy_freq=policy_freq)
+    agent.args.alpha, batch = 2.5, make_batch()
+    if hasattr(agent, "value"):
+        center_value(agent, batch)
+    before = numpy_networks(agent)
+    metrics = agent.update(batch, step)
     assert ("actor_loss" in metrics) == moves
-    for name, parameters in arrays(networks).items():
-        changed = any((old != new).any() for old, new in zip(before[name], parameters))
+    for name, parameters in numpy_networks(agent).items():
+        pairs = zip(before[name], parameters, strict=True)
+        changed = any((old != new).any() for old, new in pairs)
         assert changed == (moves or name in ("critic", "value")), name
 
 
 def test_networks_are_table_4s_and_start_alike():
-    networks = {n: s.make_networks(OBS, ACT, s.Args(seed=5), "cpu")[0] for n, s in SCRIPTS.items()}
-    shapes = [tuple(p.shape) for p in networks["wpc"]["value"].parameters()]
-    assert shapes == [(256, OBS), (256,), (256, 256), (256,), (1, 256), (1,)]
-    for other in ("td3_bc", "wbc"):
-        for name, network in networks[other].items():
-            for p, q in zip(network.parameters(), networks["wpc"][name].parameters(), strict=True):
-                assert torch.equal(p, q)
-    actor, other_seed = networks["wpc"]["actor"], wpc.make_networks(OBS, ACT, wpc.Args(seed=6), "cpu")[0]["actor"]
-    assert not torch.equal(actor[0].weight, other_seed[0].weight)
-    assert actor(1e6 * torch.ones(1, OBS)).abs().max() == 1
+    agents = {}
+    for name, script in SCRIPTS.items():
+        torch.manual_seed(5)
+        args = script.Args()
+        agents[name] = script.Agent(STATE_DIM, ACTION_DIM, MAX_ACTION, args)
+    shapes = [tuple(p.shape) for p in agents["wpc"].value.parameters()]
+    hidden = [(256, STATE_DIM), (256,), (256, 256), (256,)]
+    assert shapes == [*hidden, (1, 256), (1,)]
+    ours = agents["wpc"].state_dict()
+    for name in ("td3_bc", "wbc"):
+        for key, parameter in agents[name].state_dict().items():
+            assert torch.equal(parameter, ours[key]), key
+    far = agents["wpc"].actor(1e6 * torch.ones(1, STATE_DIM))
+    assert far.abs().max() == MAX_ACTION
 
 
-def twenty_steps(script, options, forced=None):
-    """Networks after 20 steps on float32 batches sampled as in `train`; `forced` is put into the last column."""
-    args = script.Args(seed=1, **options)
-    networks, optimizers = script.make_networks(OBS, ACT, args, "cpu")
-    data, rng = torch.randn(500, 2 * OBS + ACT + 3, generator=torch.Generator().manual_seed(0)), torch.Generator().manual_seed(1)
+def twenty_steps(script, better_half=None, **options):
+    """An agent after 20 steps in float32, the last column filled with `better_half`."""
+    torch.manual_seed(1)
+    agent = script.Agent(STATE_DIM, ACTION_DIM, MAX_ACTION, script.Args(**options))
+    torch.manual_seed(1)
+    dataset = {key: x.float() for key, x in make_batch().items()}
+    if better_half is not None:
+        dataset["better_half"] = torch.full((BATCH, 1), better_half)
+    torch.manual_seed(1)
     for step in range(1, 21):
-        rows = data[torch.randint(len(data), (256,), generator=rng)]
-        batch = list(rows.split([OBS, ACT, 1, 1, OBS, 1], 1))
-        batch[-1] = torch.full((256, 1), forced) if forced is not None else batch[-1]
-        script.update(networks, optimizers, batch[: 6 if script is wpc else 5], args, step, rng)
-    return arrays(networks)
+        agent.update(script.sample_batch(dataset, 32), step)
+    return agent.state_dict()
 
 
-def assert_same(one, other, names):
-    for name in names:
-        assert all(np.array_equal(p, q) for p, q in zip(one[name], other[name], strict=True)), name
-
-
-ALL = ("actor", "critic", "actor_target", "critic_target")
+def assert_same(one, other):
+    """Both state dicts agree to the last bit where they share a network."""
+    shared = one.keys() & other.keys()
+    assert {key.split(".")[0] for key in shared} >= {"actor", "critic", "actor_target"}
+    for key in shared:
+        assert torch.equal(one[key], other[key]), key
 
 
 def test_wpc_with_weight_one_is_td3_bc():
-    assert_same(twenty_steps(wpc, {"alpha": 2.5, "weight": "static"}, 1.0), twenty_steps(td3_bc, {"alpha": 2.5}), ALL)
+    ours = twenty_steps(wpc, better_half=1.0, alpha=2.5, weight="static")
+    assert_same(ours, twenty_steps(td3_bc, alpha=2.5))
 
 
 def test_wpc_without_the_q_term_is_wbc():
-    assert_same(twenty_steps(wpc, {"alpha": 0.0}), twenty_steps(wbc, {}), (*ALL, "value"))
+    assert_same(twenty_steps(wpc, alpha=0.0), twenty_steps(wbc))
 
 
-def test_td3_bc_with_alpha_zero_is_behaviour_cloning():
-    args = td3_bc.Args(seed=1)
-    actor = td3_bc.make_networks(OBS, ACT, args, "cpu")[0]["actor"]
-    optimizer = torch.optim.Adam(actor.parameters(), 3e-4, fused=True)
-    data, rng = torch.randn(500, 2 * OBS + ACT + 3, generator=torch.Generator().manual_seed(0)), torch.Generator().manual_seed(1)
+def test_td3_bc_without_the_q_term_is_behaviour_cloning():
+    torch.manual_seed(1)
+    actor = td3_bc.Agent(STATE_DIM, ACTION_DIM, MAX_ACTION, td3_bc.Args()).actor
+    optimizer = td3_bc.adam(actor, 3e-4)
+    dataset = {key: x.float() for key, x in make_batch().items()}
+    torch.manual_seed(1)
     for step in range(1, 21):
-        rows = data[torch.randint(len(data), (256,), generator=rng)]
-        torch.randn(256, ACT, generator=rng)
+        batch = td3_bc.sample_batch(dataset, 32)
+        torch.randn(32, ACTION_DIM)  # the target's noise
         if step % 2 == 0:
+            pi = actor(batch["observations"])
             optimizer.zero_grad()
-            ((actor(rows[:, :OBS]) - rows[:, OBS : OBS + ACT]) ** 2).mean().backward()
+            ((pi - batch["actions"]) ** 2).mean().backward()
             optimizer.step()
-    assert_same(twenty_steps(td3_bc, {"alpha": 0.0}), arrays({"actor": actor}), ["actor"])
+    theirs = twenty_steps(td3_bc, alpha=0.0)
+    for key, parameter in actor.state_dict().items():
+        assert torch.equal(parameter, theirs[f"actor.{key}"])
 
 
-def weights(kind, advantage, seed=0, **options):
-    """wpc's weights for given advantages, read off the actor's gradient-free loss: one row a batch entry."""
-    args = wpc.Args(alpha=0.0, weight=kind, policy_lr=0.0, q_lr=0.0, v_lr=0.0, **options)
-    networks, optimizers = wpc.make_networks(1, 1, args, "cpu")
-    with torch.no_grad():
-        for network in (*networks["critic"], networks["value"], networks["actor"]):
-            for p in network.parameters():
-                p.zero_()
-        q1 = networks["critic"][0]  # Q1(s, a) = relu(s) - relu(-s) = s, V = 0, pi = 0
-        q1[0].weight[:2, 0], q1[2].weight[0, 0], q1[2].weight[1, 1] = torch.tensor([1.0, -1.0]), 1, 1
-        q1[4].weight[0, :2] = torch.tensor([1.0, -1.0])
-    result, rng = [], torch.Generator().manual_seed(seed)
-    state = rng.get_state()
-    s = torch.as_tensor(advantage, dtype=torch.float32)[:, None]
-    for i in range(len(s)):  # only entry i has an action to imitate: the loss is its weight / batch
-        a = torch.zeros(len(s), 1)
-        a[i] = 1
-        rng.set_state(state)
-        batch = (s, a, 0 * a, 0 * a, s, 0 * a)
-        result.append(wpc.update(networks, copy.deepcopy(optimizers), batch, args, 2, rng)["actor_loss"].item() * len(s))
-    return np.array(result)
+ADVANTAGES = [-1e4, -2.0, -1e-3, 0.0, 1e-3, 0.5, 3.0, 1e4]
 
 
-ADVANTAGE = np.array([-1e4, -2.0, -1e-3, 0.0, 1e-3, 0.5, 3.0, 1e4])
+def weights_of(kind, seed=0, **options):
+    """wpc's weights of `ADVANTAGES`, read off the gradient of the policy's constraint:
+    with pi = 0, a = 1 and no Q term, it is proportional to the weight."""
+    n = len(ADVANTAGES)
+    args = wpc.Args(alpha=0.0, weight=kind, critic_lr=0.0, value_lr=0.0, **options)
+    agent = wpc.Agent(n, 1, 1.0, args)
+    for parameter in agent.parameters():
+        parameter.data.zero_()
+    hidden = torch.eye(256)[: 2 * n]
+    agent.critic.q1_net[0].weight.data[: 2 * n, :n] = torch.cat(
+        [torch.eye(n), -torch.eye(n)]
+    )
+    agent.critic.q1_net[2].weight.data[: 2 * n] = hidden
+    scale = torch.tensor(ADVANTAGES)
+    agent.critic.q1_net[4].weight.data[0, :n] = scale  # Q1(s, a) = advantage of s
+    agent.actor.net[0].weight.data[:n] = torch.eye(256)[:n, :n]
+    agent.actor.net[2].weight.data[:n] = torch.eye(256)[:n]
+    states = torch.eye(n)  # entry i of the batch alone reaches weight i of the policy
+    column = torch.zeros(n, 1)
+    batch = {
+        "observations": states,
+        "actions": column + 1,
+        "rewards": column,
+        "next_observations": states,
+        "terminals": column,
+    }
+    torch.manual_seed(seed)
+    agent.update(batch, step=2)
+    gradient = agent.actor.net[4].weight.grad[0, :n]
+    return (-gradient * n / 2).numpy()
 
 
 def test_binary_weight():
-    assert weights("binary", ADVANTAGE).tolist() == [0, 0, 0, 0, 1, 1, 1, 1]  # strictly better: eq. 7
+    assert weights_of("binary").tolist() == [0, 0, 0, 0, 1, 1, 1, 1]  # eq. 7: A > 0
 
 
 @pytest.mark.parametrize("beta", [1.0, 0.1, 10.0])
-def test_exponential_weight_is_cut_off_and_never_overflows(beta):
-    expected = np.exp(np.minimum(ADVANTAGE / beta, np.log(100)))
-    assert weights("exponential", ADVANTAGE, beta=beta) == pytest.approx(expected, rel=1e-5)
+def test_exponential_weight_is_cut_off_at_100(beta):
+    expected = np.exp(np.minimum(np.array(ADVANTAGES) / beta, np.log(100)))  # eq. 8
+    assert weights_of("exponential", beta=beta) == pytest.approx(expected, rel=1e-5)
 
 
 def test_random_weight_is_a_new_permutation_each_time():
-    draws = [weights("random", ADVANTAGE, seed) for seed in range(8)]
+    draws = [weights_of("random", seed=seed).tolist() for seed in range(8)]
     assert all(sorted(draw) == [0] * 4 + [1] * 4 for draw in draws)
     assert len({tuple(draw) for draw in draws}) > 4

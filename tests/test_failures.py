@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: MIT
+"""What goes wrong gets one sentence that is true, and destroys nothing."""
+
+import errno
+import json
+import os
+import resource
+
+import numpy as np
+import pytest
+import torch
+from conftest import (
+    as_bits,
+    assert_one_sentence,
+    command,
+    d4rl_arrays,
+    load,
+    read_curves,
+    result,
+    run,
+    wpc,
+    write_hdf5,
+)
+from test_data import damage
+
+# Wrong arguments
+
+MISTAKES = [
+    (["--env", "hopper-medium-v0"], "--env hopper-medium-v0 is none of halfcheetah-r"),
+    (["--env", "ant"], "--env ant is none of"),
+    (["--env", "hopper"], "'observations' has shape (90000, 17), not (90000, 11)"),
+    (["--dataset", "nowhere.hdf5"], "nowhere.hdf5 is no file: name one"),
+    (["--dataset", "."], ". is no file: name one"),
+    (["--tau", "1.5"], "--tau is 1.5, but must be from 0 to 1"),
+    (["--discount", "nan"], "--discount is nan"),
+    (["--alpha", "inf"], "--alpha is inf"),
+    (["--alpha", "-1"], "--alpha is -1.0"),
+    (["--beta", "0"], "--beta is 0.0"),
+    (["--critic-lr", "-1"], "--critic-lr is -1.0"),
+    (["--batch-size", "0"], "--batch-size is 0, but must be from 1"),
+    (["--batch-size", "100000"], "too few for --batch-size 100000"),
+    (
+        ["--eval-episodes", "1001"],
+        "--eval-episodes is 1001, but must be from 1 to 1000",
+    ),
+    (["--eval-freq", "0"], "--eval-freq is 0"),
+    (["--policy-freq", "0"], "--policy-freq is 0"),
+    (["--seed", "-1"], "--seed is -1"),
+]
+
+
+@pytest.mark.parametrize("arguments, sentence", MISTAKES)
+def test_mistakes_get_one_sentence(tmp_path, arguments, sentence):
+    process = run(*command("wpc", *arguments), cwd=tmp_path)
+    assert_one_sentence(process, sentence)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_gpu_that_is_not_there(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SystemExit, match="--device cuda needs a GPU"):
+        wpc.check_args(wpc.Args(device="cuda"))
+
+
+def test_every_number_has_limits(script):
+    numbers = {
+        name
+        for name, value in vars(script.Args()).items()
+        if type(value) in (int, float) or name == "alpha"
+    }
+    assert script.LIMITS.keys() == numbers
+
+
+def test_run_folders_that_cannot_be(tmp_path):
+    (tmp_path / "file").write_text("content")
+    for run_dir in (tmp_path / "file", tmp_path / "file/run", "/proc/run"):
+        process = run(*command("wpc", "--run-dir", run_dir))
+        assert_one_sentence(process, "or choose another --run-dir")
+    assert (tmp_path / "file").read_text() == "content"
+
+
+def test_a_folder_of_another_version(run_dir):
+    args = json.loads((run_dir / "args.json").read_text())
+    (run_dir / "args.json").write_text(json.dumps(args | {"v_lr": 1.0}))
+    before = result(run_dir)
+    process = run(*command("wpc")[:2], "--run-dir", run_dir)
+    assert_one_sentence(process, "or another version of wpc.py")
+    assert result(run_dir) == before
+
+
+# Damage
+
+
+def test_damaged_checkpoints(finished, tmp_path):
+    """They are told, or load. (A disk's own checksums guard the bytes of a tensor.)"""
+    rng, content = np.random.default_rng(0), (finished / "checkpoint.pt").read_bytes()
+    told = 0
+    for _ in range(150):
+        (tmp_path / "checkpoint.pt").write_bytes(damage(content, rng))
+        try:
+            wpc.load_checkpoint(tmp_path)
+        except SystemExit as stop:
+            told += 1
+            assert "checkpoint.pt can't be loaded" in stop.code
+            assert "\n" not in stop.code and "delete" not in stop.code
+    assert told > 40
+
+
+def test_a_damaged_checkpoint_stops_the_run(run_dir):
+    content = (run_dir / "checkpoint.pt").read_bytes()[:-100]
+    (run_dir / "checkpoint.pt").write_bytes(content)
+    process = run(*command("wpc")[:2], "--run-dir", run_dir)
+    assert_one_sentence(process, "checkpoint.pt can't be loaded (RuntimeError")
+    assert (run_dir / "checkpoint.pt").read_bytes() == content
+
+
+def test_damaged_arguments_stop_the_run(run_dir):
+    (run_dir / "args.json").write_text("{")
+    process = run(*command("wpc")[:2], "--run-dir", run_dir)
+    assert_one_sentence(process, "args.json can't be read")
+
+
+def test_the_true_reason_why_a_checkpoint_cannot_be_loaded(monkeypatch, run_dir):
+    def refuse(*args, **kwargs):
+        raise PermissionError(errno.EACCES, "Permission denied", "checkpoint.pt")
+
+    monkeypatch.setattr(torch, "load", refuse)
+    with pytest.raises(SystemExit, match="Permission denied") as stop:
+        wpc.load_checkpoint(run_dir)
+    assert "damaged" not in stop.value.code
+
+
+def test_nothing_in_a_checkpoint_is_run(tmp_path):
+    class Malicious:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "harm"),)
+
+    torch.save({"step": Malicious()}, tmp_path / "checkpoint.pt")
+    with pytest.raises(SystemExit, match="can't be loaded"):
+        wpc.load_checkpoint(tmp_path)
+    assert not (tmp_path / "harm").exists()
+    torch.load(tmp_path / "checkpoint.pt", weights_only=False)
+    assert (tmp_path / "harm").exists()  # it would have been
+
+
+# No space, no memory
+
+
+@pytest.mark.parametrize("limit", [100, 20_000, 1_000_000])
+def test_a_full_disk(run_dir, limit):
+    before = result(run_dir)
+    limits = (limit, limit)
+    process = run(
+        *command("wpc", "--run-dir", run_dir, "--max-timesteps", 80),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limits),
+    )
+    assert_one_sentence(process, "the run folder can't be written ([Errno 27] File too")
+    assert as_bits(load(run_dir)) == before[0]
+    assert run(*command("wpc", "--run-dir", run_dir)).returncode == 0  # space again
+    assert as_bits(load(run_dir)) == before[0]
+
+
+@pytest.mark.parametrize("moment", ["write", "replace"])
+def test_a_file_is_written_whole_or_not_at_all(monkeypatch, tmp_path, moment):
+    path = tmp_path / "file"
+    wpc.write_file(path, b"old")
+
+    def fail(*args):
+        raise OSError(errno.EIO, "broken")
+
+    monkeypatch.setattr(os, {"write": "fsync", "replace": "replace"}[moment], fail)
+    with pytest.raises(OSError, match="broken"):
+        wpc.write_file(path, b"new")
+    assert path.read_bytes() == b"old"
+    monkeypatch.undo()
+    wpc.write_file(path, b"new")
+    assert path.read_bytes() == b"new"
+
+
+def test_out_of_memory(tmp_path):
+    """A batch that does not fit into memory, and a dataset that does not."""
+    limits = (6 * 2**30, 6 * 2**30)
+    process = run(
+        *command(
+            "wpc",
+            "--batch-size",
+            80_000,
+            "--max-timesteps",
+            1,
+            "--run-dir",
+            tmp_path / "run",
+        ),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, limits),
+    )
+    if process.returncode:  # where it does fit, there is nothing to tell
+        assert_one_sentence(process, "out of memory")
+    for error in (MemoryError(), torch.OutOfMemoryError("CUDA out of memory")):
+        with pytest.raises(SystemExit, match="out of memory"):
+            run_main(error)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("a bug"), OSError("a bug"), KeyError()])
+def test_our_own_mistakes_keep_their_traceback(error):
+    with pytest.raises(type(error)):
+        run_main(error)
+
+
+def run_main(error):
+    """wpc.main, in which training fails so."""
+
+    def train(args):
+        raise error
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wpc, "train", train)
+        patch.setattr(wpc, "parse_args", lambda: None)
+        patch.setattr("sys.stdout.reconfigure", lambda **_: None, raising=False)
+        wpc.main()
+
+
+# Divergence
+
+
+def test_divergence_stops_the_run_and_keeps_the_last_checkpoint(tmp_path):
+    arrays = d4rl_arrays(400)
+    arrays["rewards"][300:] = 1e30  # rarely met at first
+    path = write_hdf5(tmp_path / "huge.hdf5", arrays)
+    line = ["--dataset", path, "--batch-size", 1, "--eval-freq", 1, "--seed", 1]
+    process = run(*command("wpc", *line, "--run-dir", tmp_path / "run"))
+    assert_one_sentence(process, "diverged by step")
+    networks = load(tmp_path / "run")["networks"].values()
+    assert all(parameter.isfinite().all() for parameter in networks)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_a_metric_or_a_parameter_that_is_not_finite(script, number):
+    agent = script.Agent(3, 1, 1.0, script.Args())
+    wpc.check_finite(agent, {"q": torch.tensor(1.0)}, step=7)
+    with pytest.raises(SystemExit, match="diverged by step 7"):
+        wpc.check_finite(agent, {"q": torch.tensor(number)}, step=7)
+    for name in ("actor", "critic_target"):
+        agent = script.Agent(3, 1, 1.0, script.Args())
+        next(getattr(agent, name).parameters()).data[0, 0] = number
+        with pytest.raises(SystemExit, match="diverged by step 7"):
+            wpc.check_finite(agent, {}, step=7)
+
+
+@pytest.mark.parametrize("best, q, told", [(10, 21, 1), (10, 19, 0), (-10, 21, 1)])
+def test_q_runs_away_from_twice_the_best_discounted_return_on(capsys, best, q, told):
+    assert wpc.warn_if_q_runs_away(5, q, best) == told
+    assert capsys.readouterr().out.count("step 5: Q is") == told
+
+
+def test_a_run_tells_once_that_q_runs_away(tmp_path):
+    arrays = d4rl_arrays(400)
+    arrays["rewards"] = np.full(400, 1e-3, np.float32)  # Q starts far above that
+    path = write_hdf5(tmp_path / "small.hdf5", arrays)
+    line = ["--max-timesteps", 20, "--log-freq", 1, "--seed", 3, "--dataset", path]
+    process = run(*command("wpc", *line, "--run-dir", tmp_path / "run"))
+    curve = [q for _, q in read_curves(tmp_path / "run")["train/q"]]
+    best = 1e-3 * sum(0.99**t for t in range(10))
+    assert sum(q > 2 * best for q in curve) > 1
+    assert process.stdout.count("over twice the dataset's best discounted return") == 1
