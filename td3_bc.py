@@ -190,7 +190,7 @@ class Agent(nn.Module):
             constraint = ((pi - a) ** 2).mean()
             actor_loss = -lmbda * q.mean() + constraint  # eq. 4
             self.actor_optimizer.zero_grad()
-            actor_loss.backward()
+            actor_loss.backward(inputs=list(self.actor.parameters()))
             self.actor_optimizer.step()
             metrics |= {"lmbda": lmbda, "actor_loss": actor_loss}
 

@@ -217,7 +217,7 @@ class Agent(nn.Module):
             pi = self.actor(s)
             actor_loss = (weight * (pi - a) ** 2).mean()  # eq. 6 with lambda = 0
             self.actor_optimizer.zero_grad()
-            actor_loss.backward()
+            actor_loss.backward(inputs=list(self.actor.parameters()))
             self.actor_optimizer.step()
             metrics["actor_loss"] = actor_loss
 

@@ -234,7 +234,7 @@ class Agent(nn.Module):
             constraint = (weight * (pi - a) ** 2).mean()
             actor_loss = -lmbda * q.mean() + constraint  # eq. 6
             self.actor_optimizer.zero_grad()
-            actor_loss.backward()
+            actor_loss.backward(inputs=list(self.actor.parameters()))
             self.actor_optimizer.step()
             metrics |= {"lmbda": lmbda, "actor_loss": actor_loss}
 

@@ -5,6 +5,8 @@ import errno
 import json
 import os
 import resource
+import signal
+import time
 
 import numpy as np
 import pytest
@@ -18,6 +20,8 @@ from conftest import (
     read_curves,
     result,
     run,
+    start,
+    wait_until,
     wpc,
     write_hdf5,
 )
@@ -230,6 +234,22 @@ def test_divergence_stops_the_run_and_keeps_the_last_checkpoint(tmp_path):
     assert_one_sentence(process, "diverged by step")
     networks = load(tmp_path / "run")["networks"].values()
     assert all(parameter.isfinite().all() for parameter in networks)
+
+
+def test_a_diverged_run_that_is_stopped_saves_nothing(tmp_path):
+    arrays = d4rl_arrays(400)
+    arrays["rewards"] = np.full(400, 1e30, np.float32)
+    path = write_hdf5(tmp_path / "huge.hdf5", arrays)
+    never = 1_000_000
+    line = ["--eval-freq", never, "--log-freq", never, "--max-timesteps", never]
+    line += ["--dataset", path, "--run-dir", tmp_path / "run"]
+    process = start(*command("wpc", *line))
+    wait_until((tmp_path / "run/args.json").exists, process)
+    time.sleep(2)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate()
+    assert process.returncode == 1 and errors.startswith("diverged by step"), errors
+    assert not (tmp_path / "run/checkpoint.pt").exists()
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])

@@ -19,9 +19,7 @@ DIFF = re.compile(r"```diff\n.*?```", re.S)
 MAP_ROW = re.compile(r"^\| (.*) \| \[\d+\]\(wpc\.py#L\d+\) \|$", re.M)
 MAP = {  # what the paper has, and how the line of wpc.py begins that does it
     "networks, Table 4": "def mlp(input_dim, output_dim):",
-    "Algorithm 1: initialize Q1, Q2": "self.critic = Critic(state_dim, action_dim)",
-    "initialize the actor": "self.actor = Actor(state_dim, action_dim, max_action)",
-    "initialize V": "self.value = Value(state_dim)",
+    "Algorithm 1: initialize": "self.critic = Critic(state_dim, action_dim)",
     "sample a batch": "batch = sample_batch(dataset, args.batch_size)",
     "the target's action a'": "a_next = self.actor_target(s_next) + noise",
     "the target y": "y = r + args.discount * (1 - done) * torch.min(q1_next, q2_next)",
