@@ -27,6 +27,8 @@ import sys
 import threading
 import time
 import warnings
+import zipfile
+import zlib
 from dataclasses import asdict, dataclass
 from http.client import HTTPException
 from pathlib import Path
@@ -483,9 +485,19 @@ def load_checkpoint(run_dir):
     if not path.exists():
         return None
     try:
+        if zipfile.ZipFile(path).testzip():  # as torch.load checks no checksums
+            sys.exit(f"{path} is damaged: a checksum in it is wrong")
         return torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, ValueError, pickle.UnpicklingError) as error:
-        reason = str(error).splitlines()[0]
+    except (
+        EOFError,
+        OSError,
+        RuntimeError,
+        ValueError,
+        pickle.UnpicklingError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
+        reason = str(error).split("\n")[0]
         sys.exit(f"{path} can't be loaded ({type(error).__name__}: {reason})")
 
 
