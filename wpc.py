@@ -493,22 +493,49 @@ def open_run_dir(args):
     return run_dir, lock
 
 
-@exit_if_unwritable()
-def start_log(run_dir, args, step):
-    """Writes the arguments; returns TensorBoard's writer, to continue after `step`."""
-    arguments = json.dumps(asdict(args), indent=2)
-    write_file(run_dir / "args.json", arguments.encode())
-    writer = SummaryWriter(run_dir, purge_step=step + 1)
-    writer.add_text("args", f"<pre>{arguments}</pre>", step)
-    return writer
+class Logger:
+    """TensorBoard's curves, and the rows of evaluations.csv."""
 
+    @exit_if_unwritable()
+    def __init__(self, run_dir, args, step, evaluations):
+        """Writes the arguments; the curves are continued after `step`."""
+        self.env = args.env
+        self.evaluations = evaluations
+        self.clock, self.clock_step = time.perf_counter(), step
 
-@exit_if_unwritable()
-def log(writer, step, prefix, numbers):
-    """Adds numbers, a dict by name, to TensorBoard's curves."""
-    for name, number in numbers.items():
-        writer.add_scalar(f"{prefix}/{name}", number, step)
-    writer.flush()
+        arguments = json.dumps(asdict(args), indent=2)
+        write_file(run_dir / "args.json", arguments.encode())
+        self.writer = SummaryWriter(run_dir, purge_step=step + 1)
+        self.writer.add_text("args", f"<pre>{arguments}</pre>", step)
+
+    @exit_if_unwritable()
+    def add_scalars(self, prefix, scalars, step):
+        for name, scalar in scalars.items():
+            self.writer.add_scalar(f"{prefix}/{name}", scalar, step)
+        self.writer.flush()
+
+    def log_metrics(self, metrics, step):
+        """Logs the metrics of this step, and the speed since the last time."""
+        self.metrics = {name: metric.item() for name, metric in metrics.items()}
+        seconds = time.perf_counter() - self.clock
+        self.metrics["steps_per_second"] = (step - self.clock_step) / seconds
+        self.clock, self.clock_step = time.perf_counter(), step
+        self.add_scalars("train", self.metrics, step)
+
+    def log_evaluation(self, returns, step):
+        """Logs the episodes' returns, and adds them to the rows with the metrics."""
+        scores = normalized_score(returns, self.env)
+        score = scores.mean().item()
+        row = {
+            "step": step,
+            "normalized_score": score,
+            "std_over_episodes": scores.std().item(),
+            "returns": " ".join(f"{x:.2f}" for x in returns),
+        }
+        self.evaluations.append(row | self.metrics)
+        self.add_scalars("eval", {"normalized_score": score}, step)
+        tqdm.write(f"step {step:,}: normalized score {score:.2f}")
+        self.clock = time.perf_counter()  # the evaluation is no training time
 
 
 @exit_if_unwritable()
@@ -637,15 +664,29 @@ def check_finite(agent, metrics, step):
         )
 
 
-def warn_if_q_runs_away(step, q, best_discounted_return):
-    """Whether Q is far above what the dataset shows to be possible: if so, says it."""
-    runs_away = q > 2 * abs(best_discounted_return)
-    if runs_away:
-        tqdm.write(
-            f"step {step:,}: Q is {q:.0f}, over twice the dataset's best discounted "
-            f"return of {best_discounted_return:.0f}: the constraint may be too weak"
-        )
-    return runs_away
+def training_state(agent):
+    """All that the next steps depend on, but the data."""
+    return {
+        "networks": agent.state_dict(),
+        "optimizers": [optimizer.state_dict() for optimizer in agent.optimizers],
+        "rng_state": torch.get_rng_state(),
+        "cuda_rng_states": torch.cuda.get_rng_state_all(),
+    }
+
+
+def restore(agent, checkpoint):
+    """Puts an agent and the random numbers into a checkpoint's `training_state`."""
+    agent.load_state_dict(checkpoint["networks"])
+    states = checkpoint["optimizers"]
+    for optimizer, state in zip(agent.optimizers, states, strict=True):
+        optimizer.load_state_dict(state)
+    torch.set_rng_state(checkpoint["rng_state"])
+    torch.cuda.set_rng_state_all(checkpoint["cuda_rng_states"])
+
+
+def q_runs_away(q, best_discounted_return):
+    """Whether Q is far above what the dataset shows to be possible."""
+    return q > 2 * abs(best_discounted_return)
 
 
 def catch_stop_signals():
@@ -688,40 +729,24 @@ def train(args):
     if checkpoint is not None:
         if checkpoint["dataset_sha256"] != sha256:
             sys.exit(f"{path} is not the dataset of the run in {run_dir}: name that")
-        agent.load_state_dict(checkpoint["networks"])
-        states = checkpoint["optimizers"]
-        for optimizer, state in zip(agent.optimizers, states, strict=True):
-            optimizer.load_state_dict(state)
+        restore(agent, checkpoint)
         step = checkpoint["step"]
         metrics = checkpoint["metrics"]
         evaluations = checkpoint["evaluations"]
-        torch.set_rng_state(checkpoint["rng_state"])
-        torch.cuda.set_rng_state_all(checkpoint["cuda_rng_states"])
 
     def save_checkpoint():
         check_finite(agent, metrics, step)
-        checkpoint = {
-            "networks": agent.state_dict(),
-            "optimizers": [optimizer.state_dict() for optimizer in agent.optimizers],
-            "step": step,
-            "metrics": metrics,
-            "evaluations": evaluations,
-            "rng_state": torch.get_rng_state(),
-            "cuda_rng_states": torch.cuda.get_rng_state_all(),
-            "mean": mean,
-            "std": std,
-            "dataset_sha256": sha256,
-        }
-        save(run_dir, checkpoint)
+        run = {"step": step, "metrics": metrics, "evaluations": evaluations}
+        data = {"mean": mean, "std": std, "dataset_sha256": sha256}
+        save(run_dir, training_state(agent) | run | data)
 
     num_transitions, num_episodes = len(dataset["rewards"]), len(discounted_returns)
     print(f"dataset  {path}")
     print(f"         {num_transitions:,} transitions in {num_episodes:,} episodes")
     print(f"run      {run_dir}, from step {step:,}, on {args.device}")
-    writer = start_log(run_dir, args, step)
+    logger = Logger(run_dir, args, step, evaluations)
     stop_signals = catch_stop_signals()
     warned = False
-    clock, clock_step = time.perf_counter(), step
     with tqdm(initial=step, total=args.max_timesteps, disable=None) as progress:
         while step < args.max_timesteps and not stop_signals:
             step += 1
@@ -732,25 +757,17 @@ def train(args):
             eval_is_due = step % args.eval_freq == 0 or step == args.max_timesteps
             if eval_is_due or step % args.log_freq == 0:
                 check_finite(agent, metrics, step)
-                numbers = {name: metric.item() for name, metric in metrics.items()}
-                seconds = time.perf_counter() - clock
-                numbers["steps_per_second"] = (step - clock_step) / seconds
-                log(writer, step, "train", numbers)
-                if not warned:
-                    warned = warn_if_q_runs_away(step, numbers["q"], best_return)
-                clock, clock_step = time.perf_counter(), step
+                logger.log_metrics(metrics, step)
+                if q_runs_away(metrics["q"], best_return) and not warned:
+                    warned = True
+                    tqdm.write(
+                        f"step {step:,}: Q is over twice the dataset's best discounted "
+                        f"return, {best_return:.0f}: the constraint may be too weak"
+                    )
             if eval_is_due:
                 returns = evaluate(envs, agent.actor, mean, std, args.seed)
-                scores = normalized_score(returns, args.env)
-                score = scores.mean().item()
-                row = {"step": step, "normalized_score": score}
-                row["std_over_episodes"] = scores.std().item()
-                row["returns"] = " ".join(f"{x:.2f}" for x in returns)
-                evaluations.append(row | numbers)
-                log(writer, step, "eval", {"normalized_score": score})
-                tqdm.write(f"step {step:,}: normalized score {score:.2f}")
+                logger.log_evaluation(returns, step)
                 save_checkpoint()
-                clock = time.perf_counter()
 
     if stop_signals:
         save_checkpoint()
@@ -761,7 +778,7 @@ def train(args):
 
 
 def hide_write_errors(failure):
-    """Prints no traceback where TensorBoard's thread can't write: `log` tells of it."""
+    """Prints no traceback where TensorBoard's thread can't write; the logger tells."""
     if not issubclass(failure.exc_type, OSError):
         threading.__excepthook__(failure)
 
