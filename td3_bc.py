@@ -485,7 +485,7 @@ class Logger:
         self.evaluations.append(row | self.metrics)
         self.add_scalars("eval", {"normalized_score": score}, step)
         tqdm.write(f"step {step:,}: normalized score {score:.2f}")
-        self.clock = time.perf_counter()  # the evaluation is no training time
+        self.clock = time.perf_counter()  # leaves out the time of evaluation
 
 
 @exit_if_unwritable()
@@ -674,7 +674,9 @@ def train(args):
     checkpoint = load_checkpoint(run_dir)
     if checkpoint is not None:
         if checkpoint["dataset_sha256"] != sha256:
-            sys.exit(f"{path} is not the dataset of the run in {run_dir}: name that")
+            sys.exit(
+                f"{path} is not the dataset that {run_dir} began with: name that one"
+            )
         restore(agent, checkpoint)
         step = checkpoint["step"]
         metrics = checkpoint["metrics"]

@@ -68,19 +68,13 @@ def test_a_run_from_start_to_end(name, tmp_path):
     for curve in curves.values():
         assert [step for step, _ in curve] == [10, 20, 30, 40, 50, 60]
 
-
-def test_the_checkpoint_replays_the_policy(script, tmp_path):
-    """Loaded into an agent, it plays the last evaluation again."""
-    process = run(*command(script.SCRIPT, "--run-dir", tmp_path))
-    assert process.returncode == 0, process.stderr
-    checkpoint = load(tmp_path)
+    script, checkpoint = SCRIPTS[name], load(run_dir)  # it plays the last row again
     agent = script.Agent(17, 6, 1.0, script.Args())
     agent.load_state_dict(checkpoint["networks"])
     mean, std = checkpoint["mean"], checkpoint["std"]
     envs = script.make_envs("halfcheetah", 2)
     returns = script.evaluate(envs, agent.actor, mean, std, seed=0)
-    played = " ".join(f"{x:.2f}" for x in returns)
-    assert played == read_rows(tmp_path)[-1]["returns"]
+    assert " ".join(f"{x:.2f}" for x in returns) == rows[-1]["returns"]
 
 
 def test_the_loop_is_update_after_update(tmp_path):
@@ -130,8 +124,6 @@ def test_alpha_is_the_papers_unless_given(tmp_path, env, arguments, alpha):
     line = command("wpc", "--env", env, "--max_timesteps", 1, *arguments)
     assert run(*line, "--run-dir", tmp_path).returncode == 0
     assert json.loads((tmp_path / "args.json").read_text())["alpha"] == alpha
-    again = run(*line[:2], "--run-dir", tmp_path)
-    assert again.returncode == 0, again.stderr
 
 
 def test_the_help_explains_every_argument(script):
@@ -256,7 +248,7 @@ def test_what_contradicts_the_run_is_refused(run_dir, name, arguments, sentence)
 def test_other_data_are_refused(run_dir, tmp_path):
     other = write_hdf5(tmp_path / "other.hdf5", d4rl_arrays(400))
     process = run(*command("wpc", "--run-dir", run_dir, "--dataset", other))
-    assert_one_sentence(process, "is not the dataset of the run")
+    assert_one_sentence(process, "is not the dataset that")
 
 
 def test_two_processes_at_once(tmp_path):
