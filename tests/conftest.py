@@ -4,6 +4,7 @@
 import csv
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -19,6 +20,7 @@ ROOT = Path(__file__).parents[1]
 DATASET = ROOT / "tests/data/halfcheetah_replay.hdf5"
 sys.path.insert(0, str(ROOT))  # the scripts are no package
 torch.set_num_threads(1)  # enough for networks this small, whatever else runs
+torch.set_flush_denormal(True)  # as the scripts do
 
 import td3_bc  # noqa: E402
 import wbc  # noqa: E402
@@ -100,6 +102,25 @@ def assert_one_sentence(process, sentence, code=1):
     assert sentence in process.stderr, process.stderr
     assert "Traceback" not in process.stderr and process.stderr.count("\n") == 1
     assert process.returncode == code
+
+
+def run_here(script, *line):
+    """Runs a command line in this process, which saves the seconds of a start."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    handlers = [signal.getsignal(number) for number in numbers]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [str(x) for x in line[1:]])
+        script.train(script.parse_args())
+    for number, handler in zip(numbers, handlers, strict=True):
+        signal.signal(number, handler)
+
+
+def refusal(script, *line):
+    """The sentence with which a script refuses a command line."""
+    with pytest.raises(SystemExit) as stop:
+        run_here(script, *line)
+    assert isinstance(stop.value.code, str) and "\n" not in stop.value.code
+    return stop.value.code
 
 
 def read_rows(run_dir):

@@ -18,6 +18,7 @@ from conftest import (
     d4rl_arrays,
     load,
     read_curves,
+    refusal,
     result,
     run,
     start,
@@ -54,10 +55,15 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize("arguments, sentence", MISTAKES)
-def test_mistakes_get_one_sentence(tmp_path, arguments, sentence):
-    process = run(*command("wpc", *arguments), cwd=tmp_path)
-    assert_one_sentence(process, sentence)
+def test_mistakes_get_one_sentence(monkeypatch, tmp_path, arguments, sentence):
+    monkeypatch.chdir(tmp_path)
+    assert sentence in refusal(wpc, *command("wpc", *arguments))
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_mistake_ends_the_process_with_that_sentence_alone(tmp_path):
+    process = run(*command("wpc", "--env", "ant"), cwd=tmp_path)
+    assert_one_sentence(process, "--env ant is none of")
 
 
 def test_a_gpu_that_is_not_there(monkeypatch):
@@ -78,8 +84,8 @@ def test_every_number_has_limits(script):
 def test_run_folders_that_cannot_be(tmp_path):
     (tmp_path / "file").write_text("content")
     for run_dir in (tmp_path / "file", tmp_path / "file/run", "/proc/run"):
-        process = run(*command("wpc", "--run-dir", run_dir))
-        assert_one_sentence(process, "or choose another --run-dir")
+        sentence = refusal(wpc, *command("wpc", "--run-dir", run_dir))
+        assert "or choose another --run-dir" in sentence
     assert (tmp_path / "file").read_text() == "content"
 
 
@@ -87,8 +93,8 @@ def test_a_folder_of_another_version(run_dir):
     args = json.loads((run_dir / "args.json").read_text())
     (run_dir / "args.json").write_text(json.dumps(args | {"v_lr": 1.0}))
     before = result(run_dir)
-    process = run(*command("wpc")[:2], "--run-dir", run_dir)
-    assert_one_sentence(process, "or another version of wpc.py")
+    sentence = refusal(wpc, *command("wpc")[:2], "--run-dir", run_dir)
+    assert "or another version of wpc.py" in sentence
     assert result(run_dir) == before
 
 
@@ -115,15 +121,15 @@ def test_damaged_checkpoints(finished, tmp_path):
 def test_a_damaged_checkpoint_stops_the_run(run_dir):
     content = (run_dir / "checkpoint.pt").read_bytes()[:-100]
     (run_dir / "checkpoint.pt").write_bytes(content)
-    process = run(*command("wpc")[:2], "--run-dir", run_dir)
-    assert_one_sentence(process, "checkpoint.pt can't be loaded (BadZipFile")
+    sentence = refusal(wpc, *command("wpc")[:2], "--run-dir", run_dir)
+    assert "checkpoint.pt can't be loaded (BadZipFile" in sentence
     assert (run_dir / "checkpoint.pt").read_bytes() == content
 
 
 def test_damaged_arguments_stop_the_run(run_dir):
     (run_dir / "args.json").write_text("{")
-    process = run(*command("wpc")[:2], "--run-dir", run_dir)
-    assert_one_sentence(process, "args.json can't be read")
+    sentence = refusal(wpc, *command("wpc")[:2], "--run-dir", run_dir)
+    assert "args.json can't be read" in sentence
 
 
 def test_the_true_reason_why_a_checkpoint_cannot_be_loaded(monkeypatch, run_dir):

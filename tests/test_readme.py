@@ -67,10 +67,9 @@ def test_files_that_it_links_to_exist():
 
 
 def test_the_snippet_acts_as_the_policy(tmp_path):
-    from conftest import command, load, read_rows, run, wpc
+    from conftest import command, load, read_rows, run_here, wpc
 
-    process = run(*command("wpc", "--run-dir", tmp_path, "--max-timesteps", 1))
-    assert process.returncode == 0, process.stderr
+    run_here(wpc, *command("wpc", "--run-dir", tmp_path, "--max-timesteps", 1))
     snippet = README.split("```python\n")[1].split("```")[0]
     observations = np.random.default_rng(0).normal(size=(4, 17))
     variables = {"observations": observations}
