@@ -65,6 +65,8 @@ class Args:
     """log the losses to TensorBoard every this many steps"""
     device: Literal["cpu", "cuda"] = "cuda" if torch.cuda.is_available() else "cpu"
     """where to train; by default on a GPU if there is one"""
+    compile: bool = False
+    """compile the update, which makes a step faster, but takes a minute at first"""
     run_dir: str | None = None
     """folder to start the run in, or to continue it; by default a new one in runs/"""
 
@@ -219,7 +221,7 @@ class Agent(nn.Module):
             pi = self.actor(s)
             actor_loss = (weight * (pi - a) ** 2).mean()  # eq. 6 with lambda = 0
             self.actor_optimizer.zero_grad()
-            actor_loss.backward(inputs=list(self.actor.parameters()))
+            actor_loss.backward()
             self.actor_optimizer.step()
             metrics["actor_loss"] = actor_loss
 
@@ -588,11 +590,16 @@ def check_args(args):
         sys.exit(f"--dataset {args.dataset} is no file: name one in D4RL's HDF5 format")
     if args.device == "cuda" and not torch.cuda.is_available():
         sys.exit("--device cuda needs a GPU, and there is none: try --device cpu")
+    if args.device == "cuda" and args.compile:
+        sys.exit("--compile is for CPUs, and untried on a GPU: add --device cpu")
     for name, (low, high) in LIMITS.items():
         value = getattr(args, name)
         if value is not None and not low <= value <= high:
             flag = name.replace("_", "-")
             sys.exit(f"--{flag} is {value}, but must be from {low} to {high}")
+
+
+CHANGEABLE = {"max_timesteps", "dataset", "device", "compile", "run_dir"}
 
 
 def parse_args():
@@ -610,7 +617,7 @@ def parse_args():
                 "continue the run with that, or choose another --run-dir"
             )
         args = tyro.cli(Args, default=Args(**saved), description=__doc__)
-        for name in saved.keys() - {"max_timesteps", "dataset", "device", "run_dir"}:
+        for name in saved.keys() - CHANGEABLE:
             if getattr(args, name) != saved[name]:
                 sys.exit(
                     f"the run in {args.run_dir} has {name} = {saved[name]}: "
@@ -620,6 +627,57 @@ def parse_args():
     if args.dataset:
         args.dataset = str(Path(args.dataset).absolute())
     return args
+
+
+# --------------------------------------------------------------------------------------
+# Compilation
+# --------------------------------------------------------------------------------------
+
+
+class TraceableAdam:
+    """Stands in for a torch.optim.Adam, on its state, where torch.compile traces it."""
+
+    def __init__(self, optimizer):
+        group = optimizer.param_groups[0]
+        self.parameters, self.lr = group["params"], group["lr"]
+        self.states = [optimizer.state[parameter] for parameter in self.parameters]
+        for parameter, state in zip(self.parameters, self.states, strict=True):
+            if not state:  # as Adam begins
+                state["step"] = torch.tensor(0.0)
+                state["exp_avg"] = torch.zeros_like(parameter)
+                state["exp_avg_sq"] = torch.zeros_like(parameter)
+        t = self.states[0]["step"].double()  # as float32 has too few digits for these
+        self.beta1_power, self.beta2_power = 0.9**t, 0.999**t
+
+    def zero_grad(self):
+        for parameter in self.parameters:
+            parameter.grad = None
+
+    @torch.no_grad()
+    def step(self):
+        self.beta1_power *= 0.9
+        self.beta2_power *= 0.999
+        step_size = self.lr / (1 - self.beta1_power)
+        bias_correction = 1 - self.beta2_power
+        for parameter, state in zip(self.parameters, self.states, strict=True):
+            m, v, gradient = state["exp_avg"], state["exp_avg_sq"], parameter.grad
+            state["step"] += 1
+            m.lerp_(gradient, 0.1)
+            v.mul_(0.999).addcmul_(gradient, gradient, value=0.001)
+            parameter -= step_size * m / ((v / bias_correction).sqrt() + 1e-8)
+
+
+def compile_update(agent):
+    """`agent.update`, each step of it one graph; it draws the same random numbers."""
+    torch._dynamo.config.trace_autograd_ops = True  # lets backward() into the graph
+    for name, optimizer in list(vars(agent).items()):
+        if isinstance(optimizer, torch.optim.Adam):
+            setattr(agent, name, TraceableAdam(optimizer))
+    options = {"cpp_wrapper": True, "fallback_random": True}
+    update = torch.compile(agent.update, fullgraph=True, dynamic=False, options=options)
+    # One graph for the steps that update the policy, one for all the others.
+    policy_freq = agent.args.policy_freq
+    return lambda batch, step: update(batch, 1 if step % policy_freq else policy_freq)
 
 
 # --------------------------------------------------------------------------------------
@@ -719,6 +777,10 @@ def train(args):
     print(f"dataset  {path}")
     print(f"         {num_transitions:,} transitions in {num_episodes:,} episodes")
     print(f"run      {run_dir}, from step {step:,}, on {args.device}")
+    update = agent.update
+    if args.compile:
+        print("compiling, which takes about a minute and pays from 20,000 steps on")
+        update = compile_update(agent)
     logger = Logger(run_dir, args, step, evaluations)
     stop_signals = catch_stop_signals()
     warned = False
@@ -726,7 +788,7 @@ def train(args):
         while step < args.max_timesteps and not stop_signals:
             step += 1
             batch = sample_batch(dataset, args.batch_size)
-            metrics |= agent.update(batch, step)
+            metrics |= update(batch, step)
             progress.update()
 
             eval_is_due = step % args.eval_freq == 0 or step == args.max_timesteps
@@ -767,11 +829,14 @@ def main():
     except KeyboardInterrupt:
         sys.exit("interrupted before the first step")
     except (MemoryError, RuntimeError) as error:
+        reason = str(error).split("\n")[0]
         # On a GPU PyTorch raises OutOfMemoryError, on a CPU only its text tells.
         memory_errors = (MemoryError, torch.OutOfMemoryError)
-        if not isinstance(error, memory_errors) and "can't allocate" not in str(error):
-            raise
-        sys.exit("out of memory: try a smaller --batch-size, or a smaller dataset")
+        if isinstance(error, memory_errors) or "can't allocate" in reason:
+            sys.exit("out of memory: try a smaller --batch-size, or a smaller dataset")
+        if isinstance(error, torch._dynamo.exc.BackendCompilerFailed):
+            sys.exit(f"--compile failed, does a C++ compiler work? {reason}")
+        raise
 
 
 if __name__ == "__main__":

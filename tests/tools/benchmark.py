@@ -1,20 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""Training speed of the scripts, against a textbook loop and against the bare matrix
-products of a step; then evaluation, loading, start-up, and runs side by side.
+"""Training speed of the scripts, plain and with --compile, against a textbook loop and
+against the bare matrix products of a step; then evaluation, loading, start-up, and runs
+side by side.
 
     python tests/tools/benchmark.py
+    python tests/tools/benchmark.py --peers TD3_BC/TD3_BC.py wPC/TD3_wBC.py
 
-All variants take turns in one process, so that whatever else the machine does meets all
-of them. Ratios of medians come first, as they carry over to other machines.
+The second line also measures files of https://github.com/sfujim/TD3_BC and
+https://github.com/qsa-fox/wPC, which you download yourself. All variants take turns in
+one process, so that whatever else the machine does meets all of them. Ratios of medians
+come first, as they carry over to other machines.
 """
 
 import csv
+import importlib.util
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import h5py
@@ -29,7 +34,7 @@ import td3_bc  # noqa: E402
 import wbc  # noqa: E402
 import wpc  # noqa: E402
 
-SHAPES = {"hopper": (11, 3), "walker2d": (17, 6)}  # HalfCheetah's are Walker2d's
+STATE_DIM, ACTION_DIM = 11, 3  # Hopper's
 BATCH, ROWS = 256, 200_000
 DATASET = ROOT / "tests/data/halfcheetah_replay.hdf5"
 
@@ -40,38 +45,61 @@ class Args:
     """turns of each variant"""
     steps: int = 40
     """training steps of a turn"""
+    peers: list[Path] = field(default_factory=list)
+    """other files to measure, with a class TD3_BC as TD3_BC.py has it"""
 
 
-def script_steps(script, state_dim, action_dim):
+def script_steps(script, compiled):
     """A script's own update, and its own sampling."""
     args = script.Args()
     args.alpha = 2.5
-    agent = script.Agent(state_dim, action_dim, 1.0, args)
+    agent = script.Agent(STATE_DIM, ACTION_DIM, 1.0, args)
+    update = script.compile_update(agent) if compiled else agent.update
     dataset = {
-        "observations": torch.randn(ROWS, state_dim),
-        "actions": torch.rand(ROWS, action_dim) * 2 - 1,
+        "observations": torch.randn(ROWS, STATE_DIM),
+        "actions": torch.rand(ROWS, ACTION_DIM) * 2 - 1,
         "rewards": torch.randn(ROWS, 1),
-        "next_observations": torch.randn(ROWS, state_dim),
+        "next_observations": torch.randn(ROWS, STATE_DIM),
         "terminals": torch.zeros(ROWS, 1),
     }
-    return lambda i: agent.update(script.sample_batch(dataset, BATCH), i)
+    return lambda i: update(script.sample_batch(dataset, BATCH), i)
 
 
-def textbook_steps(state_dim, action_dim):
-    """wPC as one would first write it: NumPy buffers, a FloatTensor for each of five
-    arrays, three plain Adams, a loop for the targets."""
-    actor, actor_target = (wpc.Actor(state_dim, action_dim, 1.0) for _ in range(2))
-    critic, critic_target = (wpc.Critic(state_dim, action_dim) for _ in range(2))
-    value = wpc.Value(state_dim)
+class Buffer:
+    """A replay buffer as TD3 first had it: NumPy arrays, and a tensor for each batch."""
+
+    def __init__(self):
+        widths = (STATE_DIM, ACTION_DIM, STATE_DIM, 1, 1)
+        self.arrays = [np.random.randn(ROWS, width) for width in widths]
+
+    def sample(self, batch_size):
+        """States, actions, next states, rewards, and 1 - done."""
+        index = np.random.randint(0, ROWS, batch_size)
+        return [torch.FloatTensor(array[index]) for array in self.arrays]
+
+
+def peer_steps(path):
+    """The training step of a file that has the class TD3_BC."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    agent, buffer = module.TD3_BC(STATE_DIM, ACTION_DIM, 1.0), Buffer()
+    return lambda i: agent.train(buffer, BATCH)
+
+
+def textbook_steps():
+    """wPC as one would first write it: a buffer of NumPy arrays, three plain Adams, a
+    loop for the targets."""
+    actor, actor_target = (wpc.Actor(STATE_DIM, ACTION_DIM, 1.0) for _ in range(2))
+    critic, critic_target = (wpc.Critic(STATE_DIM, ACTION_DIM) for _ in range(2))
+    value = wpc.Value(STATE_DIM)
     actor_optimizer = torch.optim.Adam(actor.parameters(), 3e-4)
     critic_optimizer = torch.optim.Adam(critic.parameters(), 3e-4)
     value_optimizer = torch.optim.Adam(value.parameters(), 3e-4)
-    widths = (state_dim, action_dim, 1, 1, state_dim)
-    data = [np.random.randn(ROWS, width) for width in widths]
+    buffer = Buffer()
 
     def step(i):
-        index = np.random.randint(0, ROWS, BATCH)
-        s, a, r, not_done, s_next = (torch.FloatTensor(x[index]) for x in data)
+        s, a, s_next, r, not_done = buffer.sample(BATCH)
         with torch.no_grad():
             noise = (torch.randn_like(a) * 0.2).clamp(-0.5, 0.5)
             a_next = (actor_target(s_next) + noise).clamp(-1, 1)
@@ -103,7 +131,7 @@ def textbook_steps(state_dim, action_dim):
     return step
 
 
-def product_steps(state_dim, action_dim):
+def product_steps():
     """The floor: only wPC's matrix products, forward and backward, at their shapes."""
 
     def network(inputs, outputs):
@@ -113,8 +141,8 @@ def product_steps(state_dim, action_dim):
             for i, o in sizes
         ]
 
-    v, q = network(state_dim, 1), network(state_dim + action_dim, 1)
-    pi = network(state_dim, action_dim)
+    v, q = network(STATE_DIM, 1), network(STATE_DIM + ACTION_DIM, 1)
+    pi = network(STATE_DIM, ACTION_DIM)
 
     def forward(network):
         for x, weight, _ in network:
@@ -142,42 +170,47 @@ def product_steps(state_dim, action_dim):
 
 
 def steps_per_second(variants, args):
-    """The median speed of each variant over its turns; the first is to warm up."""
+    """The median speed of each variant over its turns."""
+    for step in variants.values():
+        step(1)  # compiles what is to be compiled
+        step(2)
     speeds = {name: [] for name in variants}
-    for _ in range(args.rounds + 1):
+    for _ in range(args.rounds):
         for name, step in variants.items():
             start = time.perf_counter()
             for i in range(1, args.steps + 1):
                 step(i)
             speeds[name].append(args.steps / (time.perf_counter() - start))
-    return {name: float(np.median(speed[1:])) for name, speed in speeds.items()}
+    return {name: float(np.median(speed)) for name, speed in speeds.items()}
 
 
 def benchmark_steps(args):
-    columns = ["wpc", "td3_bc", "wbc", "textbook", "products"]
-    header = ["", "threads", "wpc / textbook", "products / wpc", *columns]
-    print("| " + " | ".join(header) + " |\n|" + "---|" * len(header))
-    results = {}
-    for robot, shape in SHAPES.items():
-        for threads in sorted({1, os.cpu_count()}):
-            torch.set_num_threads(threads)
-            variants = {"textbook": textbook_steps(*shape)}
-            variants["products"] = product_steps(*shape)
-            for script in (wpc, td3_bc, wbc):
-                variants[script.SCRIPT] = script_steps(script, *shape)
-            speed = steps_per_second(variants, args)
-            ratio = speed["wpc"] / speed["textbook"]
-            floor = speed["products"] / speed["wpc"]
-            cells = [robot, str(threads), f"{ratio:.2f}", f"{floor:.2f}"]
-            cells += [f"{speed[name]:.0f}" for name in columns]
-            print("| " + " | ".join(cells) + " |")
-            results[robot] = speed["wpc"]
-    return results
+    """Prints a table with a row for each variant; returns wpc's speed on one thread."""
+    columns = {}
+    for threads in sorted({1, os.cpu_count()}):
+        torch.set_num_threads(threads)
+        torch._dynamo.reset()  # what is compiled depends on the number of threads
+        variants = {"textbook": textbook_steps(), "products": product_steps()}
+        for script in (wpc, td3_bc, wbc):
+            variants[script.SCRIPT] = script_steps(script, compiled=False)
+            variants[f"{script.SCRIPT} --compile"] = script_steps(script, compiled=True)
+        variants |= {path.name: peer_steps(path) for path in args.peers}
+        columns[threads] = steps_per_second(variants, args)
+    header = "| "
+    for threads in columns:
+        header += f"| {threads} thread(s): / textbook | steps/s "
+    print(f"{header}|\n|---|" + "---|---|" * len(columns))
+    for name in columns[1]:
+        row = f"| {name} "
+        for speed in columns.values():
+            row += f"| {speed[name] / speed['textbook']:.2f} | {speed[name]:.0f} "
+        print(f"{row}|")
+    return columns[1]["wpc"]
 
 
-def benchmark_evaluation(speeds):
+def benchmark_evaluation(speed):
     """The share of evaluation in a run: every 5,000 steps, 10 full-length episodes."""
-    for robot, (state_dim, action_dim) in SHAPES.items():
+    for robot, state_dim, action_dim in (("hopper", 11, 3), ("walker2d", 17, 6)):
         envs = wpc.make_envs(robot, 10)
         for env in envs.envs:  # full-length episodes, whatever the policy
             env.unwrapped._terminate_when_unhealthy = False
@@ -189,7 +222,7 @@ def benchmark_evaluation(speeds):
             wpc.evaluate(envs, actor, mean, std, seed)
             times.append(time.perf_counter() - start)
         seconds = float(np.median(times))
-        share = seconds / (seconds + 5000 / speeds[robot])
+        share = seconds / (seconds + 5000 / speed)
         print(f"evaluation, {robot}: {seconds:.2f} s, {100 * share:.1f}% of a run")
 
 
@@ -269,8 +302,8 @@ def benchmark_side_by_side(folder, args):
 
 def main(args: Args):
     torch.set_flush_denormal(True)
-    speeds = benchmark_steps(args)
-    benchmark_evaluation(speeds)
+    speed = benchmark_steps(args)
+    benchmark_evaluation(speed)
     with tempfile.TemporaryDirectory() as folder:
         benchmark_loading(Path(folder))
         benchmark_start(Path(folder))
