@@ -66,7 +66,7 @@ def script_steps(script, compiled):
 
 
 class Buffer:
-    """A replay buffer as TD3 first had it: NumPy arrays, and a tensor for each batch."""
+    """A replay buffer as TD3 first had it: NumPy arrays, and new tensors a batch."""
 
     def __init__(self):
         widths = (STATE_DIM, ACTION_DIM, STATE_DIM, 1, 1)
