@@ -49,8 +49,9 @@ from tqdm import tqdm
 @dataclass
 class Args:
     # Experiment
-    env: str = "hopper-medium-v2"
-    """D4RL task; with --dataset, also just halfcheetah, hopper or walker2d"""
+    env: str | None = None
+    """D4RL task, such as hopper-medium-v2; with --dataset, also halfcheetah, hopper,
+    walker2d or a Gymnasium environment, by default the one that the file names"""
     dataset: str | None = None
     """HDF5 file in D4RL's format; by default the task's, downloaded on first use"""
     seed: int = 0
@@ -249,25 +250,55 @@ def soft_update(target, network, tau):
 # Evaluation
 # --------------------------------------------------------------------------------------
 
-ENVIRONMENTS = {
-    # Gymnasium's environment, and the returns that D4RL scores 0 and 100. Of all
-    # versions, -v4 is the closest to the -v2 with mujoco-py that D4RL evaluates on.
-    "halfcheetah": ("HalfCheetah-v4", -280.178953, 12135.0),
-    "hopper": ("Hopper-v4", -20.272305, 3234.3),
-    "walker2d": ("Walker2d-v4", 1.629008, 4592.3),
+D4RL_ROBOTS = {  # -v4 is the closest to the -v2 with mujoco-py that D4RL evaluates on
+    "halfcheetah": "HalfCheetah-v4",
+    "hopper": "Hopper-v4",
+    "walker2d": "Walker2d-v4",
+}
+D4RL_RETURNS = {  # which D4RL scores 0, a random policy's, and 100, an expert's
+    "HalfCheetah-v4": (-280.178953, 12135.0),
+    "Hopper-v4": (-20.272305, 3234.3),
+    "Walker2d-v4": (1.629008, 4592.3),
 }
 
 
+def gymnasium_id(env):
+    """Gymnasium's name for a robot or a task of D4RL; any other name is one already."""
+    robot = env.split("-")[0] if env in D4RL_SHA256 else env
+    return D4RL_ROBOTS.get(robot, env)
+
+
 def make_envs(env, num_envs):
-    """`num_envs` of Gymnasium's environments for a task or robot, stepped together."""
+    """`num_envs` environments for a task, robot or Gymnasium name, stepped together.
+
+    Exits with a sentence if there is none, or if our networks don't fit its spaces.
+    """
     warnings.filterwarnings("ignore", message=".*out of date")  # -v4 is what we want
-    env_id = ENVIRONMENTS[env.split("-")[0]][0]
-    return gym.make_vec(env_id, num_envs, vectorization_mode="sync")
+    try:
+        envs = gym.make_vec(gymnasium_id(env), num_envs, vectorization_mode="sync")
+    except (gym.error.Error, ImportError) as error:
+        reason = str(error).split("\n")[0]
+        sys.exit(f"--env {env} can't be made: {reason}")
+    states, actions = envs.single_observation_space, envs.single_action_space
+    for space in (states, actions):
+        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+            sys.exit(
+                f"--env {env} has the states {states} and the actions {actions}: both "
+                "must be a Box of one axis"
+            )
+    largest = actions.high[0]
+    alike = (actions.high == largest).all() and (actions.low == -largest).all()
+    if not alike or np.isinf(largest):
+        sys.exit(
+            f"--env {env} has the actions {actions}: all must go from -x to x with the "
+            "same x, which Gymnasium's RescaleAction can bring about"
+        )
+    return envs
 
 
 def normalized_score(returns, env):
     """D4RL's score of these returns: 0 for a random policy's, 100 for an expert's."""
-    _, random_return, expert_return = ENVIRONMENTS[env.split("-")[0]]
+    random_return, expert_return = D4RL_RETURNS[gymnasium_id(env)]
     return 100 * (returns - random_return) / (expert_return - random_return)
 
 
@@ -346,32 +377,47 @@ def download_dataset(task):
     )
 
 
+@contextlib.contextmanager
+def exit_if_damaged(path):
+    """Exits with a sentence where an HDF5 file can't be read."""
+    try:
+        yield
+    except (KeyError, OSError, RuntimeError, TypeError, ValueError) as error:
+        sys.exit(
+            f"{path} is no HDF5 file in D4RL's format, or is damaged ({error}); if it "
+            "is a download of D4RL's, delete it to download it again"
+        )
+
+
+def read_env_id(path):
+    """The Gymnasium environment that a dataset was collected on, None if it is silent.
+
+    It is the file's attribute "env_id", which D4RL's files don't have.
+    """
+    with exit_if_damaged(path), h5py.File(path) as file:
+        return file.attrs.get("env_id")
+
+
 def read_hdf5(path, widths):
     """Arrays of an HDF5 file, float32 (N, width), for the widths given by name.
 
     Exits with a sentence if one is missing, of another shape or not finite.
     """
     arrays = {}
-    try:
-        with h5py.File(path) as file:
-            for key, width in widths.items():
-                if key not in file:
-                    sys.exit(f"{path} has no '{key}'")
-                array = file[key][:]
-                if array.ndim == 1:
-                    array = array[:, None]
-                shape = (len(file["observations"]), width)
-                if array.shape != shape:
-                    sys.exit(f"{path}: '{key}' has shape {array.shape}, not {shape}")
-                with np.errstate(over="ignore"):  # beyond float32, numbers are infinite
-                    arrays[key] = array.astype(np.float32)
-                if not np.isfinite(arrays[key]).all():
-                    sys.exit(f"{path}: '{key}' holds NaN or infinite numbers")
-    except (KeyError, OSError, RuntimeError, TypeError, ValueError) as error:
-        sys.exit(
-            f"{path} is no HDF5 file in D4RL's format, or is damaged ({error}); if it "
-            "is a download of D4RL's, delete it to download it again"
-        )
+    with exit_if_damaged(path), h5py.File(path) as file:
+        for key, width in widths.items():
+            if key not in file:
+                sys.exit(f"{path} has no '{key}'")
+            array = file[key][:]
+            if array.ndim == 1:
+                array = array[:, None]
+            shape = (len(file["observations"]), width)
+            if array.shape != shape:
+                sys.exit(f"{path}: '{key}' has shape {array.shape}, not {shape}")
+            with np.errstate(over="ignore"):  # beyond float32, numbers are infinite
+                arrays[key] = array.astype(np.float32)
+            if not np.isfinite(arrays[key]).all():
+                sys.exit(f"{path}: '{key}' holds NaN or infinite numbers")
     return arrays
 
 
@@ -397,7 +443,9 @@ def load_dataset(path, state_dim, action_dim, args):
     transitions = {key: array[keep] for key, array in arrays.items()}
     transitions["next_observations"] = arrays["observations"][keep + 1]
 
-    ends = timeouts | (arrays["terminals"][:, 0] != 0)
+    ends = arrays["terminals"][:, 0] != 0
+    ends[:-1] &= ~timeouts[1:]  # such a row may follow, with the last observation
+    ends |= timeouts
     rewards = arrays["rewards"][:, 0].astype(np.float64)
     episodes = np.split(rewards, np.flatnonzero(ends[:-1]) + 1)
     discounted_returns = np.array(
@@ -503,17 +551,19 @@ class Logger:
 
     def log_evaluation(self, returns, step):
         """Logs the episodes' returns, and adds them to the rows with the metrics."""
-        scores = normalized_score(returns, self.env)
+        name, scores = "mean_return", returns
+        if gymnasium_id(self.env) in D4RL_RETURNS:
+            name, scores = "normalized_score", normalized_score(returns, self.env)
         score = scores.mean().item()
         row = {
             "step": step,
-            "normalized_score": score,
+            name: score,
             "std_over_episodes": scores.std().item(),
             "returns": " ".join(f"{x:.2f}" for x in returns),
         }
         self.evaluations.append(row | self.metrics)
-        self.add_scalars("eval", {"normalized_score": score}, step)
-        tqdm.write(f"step {step:,}: normalized score {score:.2f}")
+        self.add_scalars("eval", {name: score}, step)
+        tqdm.write(f"step {step:,}: {name.replace('_', ' ')} {score:.2f}")
         self.clock = time.perf_counter()  # leaves out the time of evaluation
 
 
@@ -581,11 +631,11 @@ LIMITS = {
 
 def check_args(args):
     """Exits with a sentence if an argument is unknown, impossible or out of range."""
-    tasks = list(D4RL_SHA256)
-    if args.dataset is not None:
-        tasks += ENVIRONMENTS
-    if args.env not in tasks:
-        sys.exit(f"--env {args.env} is none of {', '.join(tasks)}")
+    if args.dataset is None and args.env not in D4RL_SHA256:
+        tasks = ", ".join(D4RL_SHA256)
+        sys.exit(
+            f"--env is {args.env}: name a D4RL task ({tasks}), or a file with --dataset"
+        )
     if args.dataset is not None and not Path(args.dataset).is_file():
         sys.exit(f"--dataset {args.dataset} is no file: name one in D4RL's HDF5 format")
     if args.device == "cuda" and not torch.cuda.is_available():
@@ -626,6 +676,12 @@ def parse_args():
     check_args(args)
     if args.dataset:
         args.dataset = str(Path(args.dataset).absolute())
+        env_id = read_env_id(args.dataset)
+        args.env = args.env or env_id
+        if args.env is None:
+            sys.exit(f"{args.dataset} names no environment: add --env")
+        if env_id and env_id != gymnasium_id(args.env):
+            print(f"warning: {args.dataset} is from {env_id}, --env is {args.env}")
     return args
 
 

@@ -33,7 +33,10 @@ def slow_load(arrays):
                 "next_observations": arrays["observations"][i + 1],
                 "terminals": arrays["terminals"][i],
             }
-        if arrays["terminals"][i] or arrays["timeouts"][i] or i + 1 == rows:
+        # A terminal row may be followed by one that only holds the last observation.
+        goes_on = i + 1 < rows and arrays["timeouts"][i + 1]
+        ends = arrays["timeouts"][i] or (arrays["terminals"][i] and not goes_on)
+        if ends or i + 1 == rows:
             episodes.append(episode)
             episode = []
     return transitions, episodes

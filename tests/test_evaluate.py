@@ -78,7 +78,7 @@ def test_the_actor_sees_normalized_observations():
     assert seen[0][:, 1:].tolist() == [[-2 / 4, -3 / 8]] * 2
 
 
-@pytest.mark.parametrize("robot", wpc.ENVIRONMENTS)
+@pytest.mark.parametrize("robot", wpc.D4RL_ROBOTS)
 def test_a_seed_fixes_the_episodes_and_no_two_share_one(robot):
     envs = wpc.make_envs(robot, 3)
     state_dim = envs.single_observation_space.shape[0]
@@ -109,5 +109,5 @@ def test_normalized_scores_are_d4rls():
             assert score == pytest.approx([0, 100])
     halfway = wpc.normalized_score(np.array([6067.5]), "halfcheetah-medium-v2")
     assert halfway == pytest.approx(100 * 6347.678953 / 12415.178953)
-    env_ids = [env_id for env_id, _, _ in wpc.ENVIRONMENTS.values()]
-    assert env_ids == ["HalfCheetah-v4", "Hopper-v4", "Walker2d-v4"]
+    env_ids = ["HalfCheetah-v4", "Hopper-v4", "Walker2d-v4"]
+    assert [*wpc.D4RL_ROBOTS.values()] == [*wpc.D4RL_RETURNS] == env_ids

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: MIT
 """Makes a medium-replay dataset in D4RL's format: all that an online SAC agent
 (Haarnoja et al., 2018) meets, from its first random steps to the policy that it ends
-with. The dataset in tests/data/ was made by
+with. It works for every environment that the scripts can use, and names it in the file.
+The dataset in tests/data/ was made by
 
     OMP_NUM_THREADS=1 python tests/tools/make_dataset.py --env HalfCheetah-v4 \\
         --steps 90000 --out tests/data/halfcheetah_replay.hdf5
 """
 
 import copy
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,13 +22,16 @@ import torch.nn.functional as F
 import tyro
 from tqdm import trange
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+import wpc
+
 
 @dataclass
 class Args:
     out: Path
     """the HDF5 file to write"""
     env: str = "HalfCheetah-v4"
-    """Gymnasium environment"""
+    """Gymnasium environment, or halfcheetah, hopper or walker2d"""
     steps: int = 90_000
     """environment steps, which is the number of transitions in the file"""
     random_steps: int = 5_000
@@ -65,10 +70,9 @@ def sample_action(actor, observation):
 
 
 def main(args: Args):
-    gym.logger.min_level = (
-        gym.logger.ERROR
-    )  # Gymnasium warns that -v4 is out of date, but -v4 is what matches D4RL's
-    env = gym.make(args.env)
+    wpc.make_envs(args.env, 1).close()  # exits if the scripts can't use it
+    env_id = wpc.gymnasium_id(args.env)
+    env = gym.make(env_id)
     env.action_space.seed(args.seed)
     torch.manual_seed(args.seed)
     obs_dim, action_dim = env.observation_space.shape[0], env.action_space.shape[0]
@@ -164,6 +168,7 @@ def main(args: Args):
             )
 
     with h5py.File(args.out, "w") as file:
+        file.attrs["env_id"] = env_id
         for key, column in data.items():
             file.create_dataset(
                 key,
