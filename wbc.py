@@ -22,8 +22,10 @@ import io
 import json
 import os
 import pickle
+import platform
 import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -32,6 +34,7 @@ import zipfile
 import zlib
 from dataclasses import asdict, dataclass
 from http.client import HTTPException
+from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
@@ -520,6 +523,34 @@ def open_run_dir(args):
     return run_dir, lock
 
 
+def git_commit():
+    """The commit of the repository that this script is in; None if there is none."""
+    line = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    folder = Path(__file__).parent
+    try:
+        process = subprocess.run(line, cwd=folder, capture_output=True, text=True)
+    except OSError:  # git is not installed
+        return None
+    return process.stdout.strip() or None
+
+
+@exit_if_unwritable()
+def record_start(run_dir, step, dataset_sha256):
+    """Adds a line to provenance.jsonl: from `step` on, what makes the results."""
+    start = {
+        "step": step,
+        "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
+        "commit": git_commit(),
+        "dataset_sha256": dataset_sha256,
+        "threads": torch.get_num_threads(),
+        "python": platform.python_version(),
+    }
+    for package in ("torch", "gymnasium", "mujoco", "numpy"):
+        start[package] = version(package)
+    with open(run_dir / "provenance.jsonl", "a") as file:
+        file.write(json.dumps(start) + "\n")
+
+
 class Logger:
     """TensorBoard's curves, and the rows of evaluations.csv."""
 
@@ -837,6 +868,7 @@ def train(args):
     if args.compile:
         print("compiling, which takes about a minute and pays from 20,000 steps on")
         update = compile_update(agent)
+    record_start(run_dir, step, sha256)
     logger = Logger(run_dir, args, step, evaluations)
     stop_signals = catch_stop_signals()
     warned = False

@@ -2,6 +2,7 @@
 """tests/tools/experiments.py from the list of commands to the report on the runs."""
 
 import csv
+import json
 import shlex
 import shutil
 import subprocess
@@ -87,6 +88,23 @@ def test_list_run_and_report(tmp_path):
         assert std == pytest.approx(abs(values[0] - values[1]) / 2**0.5, abs=0.051)
     assert cells[0][4:6] == ["2", "48.3"] and cells[0][9] == "44.6"
     assert cells[0][10:12] == ["missing", "missing"]  # wBC
+
+
+def test_scripts_of_different_content_are_told_apart(tmp_path):
+    """Two seeds of each system: wBC's runs are of one script, wPC's are of two."""
+    runs = ROOT / "tests/results"
+    for system, hashes in (("wbc", "aa"), ("wpc", "ab")):
+        for seed, sha256 in enumerate(hashes):
+            run_dir = tmp_path / f"{system}__{TASK}__{seed}"
+            shutil.copytree(runs / f"{system}__{TASK}__{seed}", run_dir)
+            line = json.dumps({"script_sha256": sha256})
+            (run_dir / "provenance.jsonl").write_text(f"{line}\n{line}\n")
+    process = run(*PROGRAM, "report", "--runs", tmp_path, "--out", tmp_path)
+    assert process.returncode == 0, process.stderr
+    notes = [x for x in process.stdout.splitlines() if "versions of the script" in x]
+    assert len(notes) == 1 and notes[0].startswith("wPC on halfcheetah-medium-replay")
+    assert "of 2 different versions" in notes[0]
+    assert notes[0] in (tmp_path / "tables.md").read_text()
 
 
 def test_a_report_without_runs(tmp_path):

@@ -4,17 +4,22 @@
 What is slow is tested on wpc.py alone: by test_twins.py it holds for the others.
 """
 
+import hashlib
 import json
 import random
 import shutil
 import signal
+import subprocess
+import sys
 import time
+from importlib.metadata import version
 
 import numpy as np
 import pytest
 import torch
 from conftest import (
     DATASET,
+    ROOT,
     SCRIPTS,
     assert_one_sentence,
     command,
@@ -105,6 +110,36 @@ def test_same_seed_same_run_other_seed_other_run(finished, tmp_path):
     run_here(wpc, *command("wpc", "--run-dir", tmp_path / "other", "--seed", 1))
     assert result(tmp_path / "same") == result(finished)
     assert read_rows(tmp_path / "other")[-1]["q"] != read_rows(finished)[-1]["q"]
+
+
+def provenance(run_dir):
+    lines = (run_dir / "provenance.jsonl").read_text().splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def test_every_start_records_what_it_is_of(finished, run_dir):
+    (start,) = provenance(finished)
+    assert start["step"] == 0 and start["threads"] == 1
+    for path, key in ((ROOT / "wpc.py", "script"), (DATASET, "dataset")):
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        assert start[f"{key}_sha256"] == digest
+    assert start["torch"] == version("torch") and start["mujoco"] == "3.15.0"
+    assert start["python"] == sys.version.split()[0]
+    run_here(wpc, *command("wpc")[:2], "--run-dir", run_dir, "--max-timesteps", 70)
+    assert [start["step"] for start in provenance(run_dir)] == [0, 60]
+
+
+def test_the_commit_if_there_is_one(monkeypatch, tmp_path):
+    monkeypatch.setattr(wpc, "__file__", str(tmp_path / "wpc.py"))
+    assert wpc.git_commit() is None
+    for line in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "first"]):
+        options = ["-c", "user.name=a", "-c", "user.email=a@example.org"]
+        subprocess.run(["git", *options, *line], cwd=tmp_path, check=True)
+    line = ["git", "rev-parse", "HEAD"]
+    head = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True).stdout
+    assert wpc.git_commit() == head.strip()
+    monkeypatch.setenv("PATH", "")
+    assert wpc.git_commit() is None
 
 
 def test_states_as_they_are(tmp_path):

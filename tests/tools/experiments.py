@@ -116,10 +116,20 @@ def command(args, system, task, seed):
     return f"OMP_NUM_THREADS=1 {shlex.join(line)}"
 
 
+def script_versions(run_dir):
+    """The SHA-256 of each version of the script that a run was started with."""
+    path = run_dir / "provenance.jsonl"
+    if not path.exists():
+        return {"unknown"}
+    lines = path.read_text().splitlines()
+    return {json.loads(line)["script_sha256"] for line in lines}
+
+
 def read_runs(folder):
     """The columns of the run folders' evaluations.csv, arrays over evaluations, as
-    {(system, task): {seed: {column: array}}}, and what to call each task."""
-    runs, names = {}, {}
+    {(system, task): {seed: {column: array}}}, the versions of the script that made them
+    as {(system, task): {SHA-256}}, and what to call each task."""
+    runs, versions, names = {}, {}, {}
     for path in sorted(folder.glob("*__*__*/evaluations.csv")):
         system, task, seed = path.parent.name.split("__")
         rows = list(csv.DictReader(path.open()))
@@ -131,10 +141,11 @@ def read_runs(folder):
             for key in ("step", "normalized_score", "q")
         }
         runs.setdefault((system, task), {})[int(seed)] = columns
+        versions.setdefault((system, task), set()).update(script_versions(path.parent))
         own_dataset = json.loads((path.parent / "args.json").read_text())["dataset"]
         short = task.removesuffix("-v2")
         names[task] = f"{short} (not D4RL's file)" if own_dataset else task
-    return runs, names
+    return runs, versions, names
 
 
 def mean_and_std(values):
@@ -224,7 +235,7 @@ def draw_figure(path, runs, names, systems, tasks, columns):
 
 
 def report(args):
-    runs, names = read_runs(args.runs)
+    runs, versions, names = read_runs(args.runs)
     if args.tasks:
         names = {task: name for task, name in names.items() if task in args.tasks}
     if not names:
@@ -248,6 +259,12 @@ def report(args):
         if shown:
             heading = title.replace("e", "e ", 1).capitalize()
             text += [f"## {heading}\n", table(runs, names, systems, shown)]
+    for (system, task), scripts in versions.items():
+        if task in names and len(scripts) > 1:
+            text.append(
+                f"{STYLES[system][0]} on {names[task]}: its runs are of {len(scripts)} "
+                "different versions of the script.\n"
+            )
     (args.out / "tables.md").write_text("\n".join(text))
 
     def draw(name, systems, tasks, columns):
