@@ -184,7 +184,8 @@ def table(runs, names, systems, tasks):
 
 
 def draw_panel(axis, runs, systems, task, column):
-    """The mean over seeds of a column, with a standard deviation on each side."""
+    """The mean over seeds of a column, with a standard deviation on each side. Dotted:
+    the score that the paper ends with."""
     for system in systems:
         seeds = list(runs.get((system, task), {}).values())
         if not seeds:
@@ -203,6 +204,9 @@ def draw_panel(axis, runs, systems, task, column):
             axis.fill_between(steps, mean - std, mean + std, **area)
         if column == "q" and np.nanmax(mean) > 10_000:  # Q runs away
             axis.set_yscale("log")
+        paper = paper_value(system, task)
+        if column == "normalized_score" and paper != "-":
+            axis.axhline(float(paper), linestyle=":", color=color, linewidth=1)
     axis.set_xlabel("training steps (thousands)")
     axis.grid(alpha=0.3)
 
