@@ -20,6 +20,7 @@ import fcntl
 import hashlib
 import io
 import json
+import math
 import os
 import pickle
 import platform
@@ -726,15 +727,20 @@ class TraceableAdam:
 
     def __init__(self, optimizer):
         group = optimizer.param_groups[0]
-        self.parameters, self.lr = group["params"], group["lr"]
+        self.parameters = group["params"]
+        self.lr, self.betas, self.eps = group["lr"], group["betas"], group["eps"]
         self.states = [optimizer.state[parameter] for parameter in self.parameters]
         for parameter, state in zip(self.parameters, self.states, strict=True):
             if not state:  # as Adam begins
                 state["step"] = torch.tensor(0.0)
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
-        t = self.states[0]["step"].double()  # as float32 has too few digits for these
-        self.beta1_power, self.beta2_power = 0.9**t, 0.999**t
+        # Multiplied as in `step`, as beta**t differs by rounding, and in float64
+        t = int(self.states[0]["step"])
+        self.beta1_power, self.beta2_power = (
+            torch.tensor(math.prod([beta] * t), dtype=torch.float64)
+            for beta in self.betas
+        )
 
     def zero_grad(self):
         for parameter in self.parameters:
@@ -742,16 +748,17 @@ class TraceableAdam:
 
     @torch.no_grad()
     def step(self):
-        self.beta1_power *= 0.9
-        self.beta2_power *= 0.999
+        beta1, beta2 = self.betas
+        self.beta1_power *= beta1
+        self.beta2_power *= beta2
         step_size = self.lr / (1 - self.beta1_power)
         bias_correction = 1 - self.beta2_power
         for parameter, state in zip(self.parameters, self.states, strict=True):
             m, v, gradient = state["exp_avg"], state["exp_avg_sq"], parameter.grad
             state["step"] += 1
-            m.lerp_(gradient, 0.1)
-            v.mul_(0.999).addcmul_(gradient, gradient, value=0.001)
-            parameter -= step_size * m / ((v / bias_correction).sqrt() + 1e-8)
+            m.lerp_(gradient, 1 - beta1)
+            v.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+            parameter -= step_size * m / ((v / bias_correction).sqrt() + self.eps)
 
 
 def compile_update(agent):
@@ -923,7 +930,7 @@ def main():
         if isinstance(error, memory_errors) or "can't allocate" in reason:
             sys.exit("out of memory: try a smaller --batch-size, or a smaller dataset")
         if isinstance(error, torch._dynamo.exc.BackendCompilerFailed):
-            sys.exit(f"--compile failed, does a C++ compiler work? {reason}")
+            sys.exit(f"--compile failed, which needs a C++ compiler: {reason}")
         raise
 
 

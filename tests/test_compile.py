@@ -71,6 +71,22 @@ def test_the_traced_step_is_the_step(monkeypatch, script, options):
     torch.testing.assert_close(traced, eager, rtol=1e-9, atol=1e-12)
 
 
+def test_a_continued_adam_has_the_same_powers_of_its_betas(script):
+    """To the last bit, which beta**t is not: each step rounds."""
+    parameter = torch.nn.Parameter(torch.zeros(1))
+    optimizer = torch.optim.Adam([parameter])
+    fresh = script.TraceableAdam(optimizer)
+    for _ in range(5000):
+        parameter.grad = torch.ones(1)
+        fresh.step()
+    continued = script.TraceableAdam(optimizer)
+    assert optimizer.state[parameter]["step"] == 5000
+    assert torch.equal(continued.beta1_power, fresh.beta1_power)
+    assert torch.equal(continued.beta2_power, fresh.beta2_power)
+    assert continued.beta2_power.item() == pytest.approx(0.999**5000)
+    assert continued.beta2_power.item() != 0.999**5000
+
+
 def assert_equal_but_for_rounding(run_dir, other):
     ours, theirs = load(run_dir), load(other)
     for key in ("networks", "optimizers"):
@@ -115,7 +131,7 @@ def test_without_a_compiler(monkeypatch, tmp_path, compiler):
     monkeypatch.setenv("CXX", compiler)
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "empty"))
     process = run(*command("wpc", "--run-dir", tmp_path / "run", "--compile"))
-    assert_one_sentence(process, "--compile failed, does a C++ compiler work?")
+    assert_one_sentence(process, "--compile failed, which needs a C++ compiler: ")
     assert not (tmp_path / "run/checkpoint.pt").exists()
 
 
