@@ -119,3 +119,24 @@ def test_the_report_on_the_results(tmp_path):
     assert process.returncode == 0, process.stderr
     made = (tmp_path / "tables.md").read_text()
     assert made == (results / "tables.md").read_text()
+
+
+def test_the_table_of_runs_that_run_away(tmp_path):
+    """It is the stored one, and by hand for a setting of two seeds."""
+    program = [sys.executable, ROOT / "tests/tools/runaway.py"]
+    stored = ROOT / "tests/results/runaway"
+    copy = shutil.copytree(stored, tmp_path / "copy")
+    (copy / "table.md").unlink()
+    assert run(*program, "--runs", copy, "--best-return", 262).returncode == 0
+    assert (copy / "table.md").read_text() == (stored / "table.md").read_text()
+
+    for seed, q in enumerate((15, 25)):
+        run_dir = tmp_path / f"small/alpha1/wpc__task__{seed}"
+        run_dir.mkdir(parents=True)
+        (run_dir / "evaluations.csv").write_text(f"step,q\n10000,5\n20000,{q}\n")
+    process = run(*program, "--runs", tmp_path / "small", "--best-return", 10)
+    last = process.stdout.splitlines()[-1]
+    assert last == "| alpha1 | 0.50, 0.50 | 1.50, 2.50 |  | 1 of 2 seeds |"
+    (tmp_path / "none").mkdir()
+    process = run(*program, "--runs", tmp_path / "none", "--best-return", 1)
+    assert_one_sentence(process, "holds no folders with runs")
