@@ -231,7 +231,8 @@ class Agent(nn.Module):
                 if args.weight == "exponential":  # wPC-e, cut off as in AWAC and IQL
                     weight = (advantage / args.beta).exp().clamp(max=100)  # eq. 8
                 elif args.weight == "random":  # wPC-rnd
-                    weight = weight[torch.randperm(len(weight), device=weight.device)]
+                    permutation = torch.randperm(len(weight), device=weight.device)
+                    weight = weight.gather(0, permutation[:, None])
                 elif args.weight == "static":  # Figure 4
                     weight = batch["better_half"]
             metrics["weight"] = weight.mean()
