@@ -536,13 +536,14 @@ def git_commit():
 
 
 @exit_if_unwritable()
-def record_start(run_dir, step, dataset_sha256):
+def record_start(run_dir, step, dataset_sha256, best_return):
     """Adds a line to provenance.jsonl: from `step` on, what makes the results."""
     start = {
         "step": step,
         "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
         "commit": git_commit(),
         "dataset_sha256": dataset_sha256,
+        "best_discounted_return": best_return,
         "threads": torch.get_num_threads(),
         "python": platform.python_version(),
     }
@@ -875,7 +876,7 @@ def train(args):
     if args.compile:
         print("compiling, which takes about a minute and pays from 20,000 steps on")
         update = compile_update(agent)
-    record_start(run_dir, step, sha256)
+    record_start(run_dir, step, sha256, best_return)
     logger = Logger(run_dir, args, step, evaluations)
     stop_signals = catch_stop_signals()
     warned = False
@@ -894,7 +895,7 @@ def train(args):
                     warned = True
                     tqdm.write(
                         f"step {step:,}: Q is over twice the dataset's best discounted "
-                        f"return, {best_return:.0f}: the constraint may be too weak"
+                        f"return, {best_return:.0f}, and may be running away"
                     )
             if eval_is_due:
                 returns = evaluate(envs, agent.actor, mean, std, args.seed)
@@ -930,7 +931,10 @@ def main():
         if isinstance(error, memory_errors) or "can't allocate" in reason:
             sys.exit("out of memory: try a smaller --batch-size, or a smaller dataset")
         if isinstance(error, torch._dynamo.exc.BackendCompilerFailed):
-            sys.exit(f"--compile failed, which needs a C++ compiler: {reason}")
+            sys.exit(
+                f"--compile failed ({reason}): it needs a C++ compiler; training works "
+                "without --compile, too"
+            )
         raise
 
 

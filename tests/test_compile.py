@@ -131,7 +131,7 @@ def test_without_a_compiler(monkeypatch, tmp_path, compiler):
     monkeypatch.setenv("CXX", compiler)
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "empty"))
     process = run(*command("wpc", "--run-dir", tmp_path / "run", "--compile"))
-    assert_one_sentence(process, "--compile failed, which needs a C++ compiler: ")
+    assert_one_sentence(process, "--compile failed (")
     assert not (tmp_path / "run/checkpoint.pt").exists()
 
 

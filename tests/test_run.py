@@ -125,6 +125,8 @@ def test_every_start_records_what_it_is_of(finished, run_dir):
         assert start[f"{key}_sha256"] == digest
     assert start["torch"] == version("torch") and start["mujoco"] == "3.15.0"
     assert start["python"] == sys.version.split()[0]
+    _, discounted_returns = wpc.load_dataset(DATASET, 17, 6, wpc.Args())
+    assert start["best_discounted_return"] == discounted_returns.max()
     run_here(wpc, *command("wpc")[:2], "--run-dir", run_dir, "--max-timesteps", 70)
     assert [start["step"] for start in provenance(run_dir)] == [0, 60]
 
