@@ -2,6 +2,7 @@
 """tests/tools/experiments.py from the list of commands to the report on the runs."""
 
 import csv
+import itertools
 import json
 import shlex
 import shutil
@@ -11,6 +12,9 @@ import sys
 import numpy as np
 import pytest
 from conftest import DATASET, ROOT, assert_one_sentence, run
+
+sys.path.insert(0, str(ROOT / "tests/tools"))
+import experiments
 
 PROGRAM = [sys.executable, ROOT / "tests/tools/experiments.py"]
 TASK = "halfcheetah-medium-replay-v2"
@@ -80,14 +84,44 @@ def test_list_run_and_report(tmp_path):
     for seed in (0, 1):
         rows = csv.DictReader((runs / f"wpc__{TASK}__{seed}/evaluations.csv").open())
         scores.append([float(row["normalized_score"]) for row in rows])
-    last, ten = np.array(scores)[:, -1], np.array(scores).mean(axis=1)
-    assert [row[1] for row in cells] == ["40", "40"]
-    for cell, values in zip(cells[0][2:4], (last, ten), strict=True):
-        mean, std = map(float, cell.split(" ± "))
-        assert mean == pytest.approx(values.mean(), abs=0.051)
-        assert std == pytest.approx(abs(values[0] - values[1]) / 2**0.5, abs=0.051)
-    assert cells[0][4:6] == ["2", "48.3"] and cells[0][9] == "44.6"
-    assert cells[0][10:12] == ["missing", "missing"]  # wBC
+    assert [len(row) for row in cells] == [5, 3, 6, 4]  # Tables 1 and 2
+    table1, difference = cells[:2]
+    assert table1[1] == "40" and table1[4].strip(" |") == "missing"  # wBC
+    mean, _, std, seeds = table1[2].split()
+    low, high = np.array(scores).mean(axis=1)
+    assert float(mean) == pytest.approx((low + high) / 2, abs=0.051)
+    assert float(std) == pytest.approx(abs(low - high) / 2**0.5, abs=0.051)
+    assert seeds == "(2)" and table1[3].endswith(" (1)")
+    assert difference[1:] == ["-", "- |"]  # TD3+BC has one seed
+    assert "| halfcheetah-medium-replay-v2 | 48.3 | 44.6 | 41.1 |" in text
+
+
+def test_scores_and_differences_by_hand():
+    three, two = np.array([1.0, 2.0, 3.0]), np.array([5.0, 7.0])
+    assert experiments.mean_and_std(three) == "2.0 ± 1.0 (3)"
+    assert experiments.mean_and_std(three[:1]) == "1.0 (1)"
+    assert experiments.mean_and_std(three[:0]) == "missing"
+    # Standard errors 1 / sqrt(3) and 1, together 1.155
+    assert experiments.difference(three, two) == "**-4.0 ± 1.2**"
+    assert experiments.difference(two, three) == "**4.0 ± 1.2**"
+    assert experiments.difference(two - 2, three) == "2.0 ± 1.2"
+    assert experiments.difference(three, two[:1]) == "-"
+
+
+def test_the_interquartile_mean_and_its_interval():
+    """By hand, and by going through all that the bootstrap could draw."""
+    tasks = np.array([[0.0, 4, 1], [43, 40, 41], [80, 87, 82]])
+    # Of nine scores, the two lowest and the two highest are left out.
+    assert experiments.interquartile_mean(*tasks) == (4 + 40 + 41 + 43 + 80) / 5
+    draws = [list(itertools.product(task, repeat=3)) for task in tasks]
+    middles = [
+        sorted(itertools.chain(*drawn))[2:-2] for drawn in itertools.product(*draws)
+    ]
+    low, high = np.percentile(np.mean(middles, axis=1), [2.5, 97.5])
+    text = experiments.interquartile_mean_and_interval(tasks)
+    assert text.startswith("41.6 [")
+    bounds = [float(number) for number in text[6:-1].split(", ")]
+    assert bounds == pytest.approx([low, high], abs=0.25)
 
 
 def test_scripts_of_different_content_are_told_apart(tmp_path):

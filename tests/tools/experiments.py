@@ -23,6 +23,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from scipy import stats
 
 TASKS = [
     f"{robot}-{kind}-v2"
@@ -41,6 +42,11 @@ EXPERIMENTS = {  # systems and tasks
     "table1": (["wpc", "td3_bc", "wbc"], TASKS),
     "table2": (["wpc", "td3_bc", "wpc-exponential", "wpc-random"], TASKS),
     "figure4": (["wpc", "wpc-static"], ["walker2d-medium-v2"]),
+}
+FIGURES = {  # of the paper, and what each shows of an experiment
+    "table1": {"figure2.png": ["normalized_score"], "figure3.png": ["q"]},
+    "table2": {"figure5.png": ["normalized_score"]},
+    "figure4": {"figure4.png": ["q", "normalized_score"]},
 }
 STYLES = {
     # How each system is called and drawn: colours that the colour-blind can tell apart
@@ -148,12 +154,43 @@ def read_runs(folder):
     return runs, versions, names
 
 
-def mean_and_std(values):
-    if not values:
+def final_scores(runs, system, task):
+    """The mean of the last ten evaluations of each seed, an array (seeds,)."""
+    seeds = runs.get((system, task), {}).values()
+    return np.array([columns["normalized_score"][-10:].mean() for columns in seeds])
+
+
+def mean_and_std(scores):
+    if len(scores) == 0:
         return "missing"
-    if len(values) == 1:
-        return f"{values[0]:.1f}"
-    return f"{np.mean(values):.1f} ± {np.std(values, ddof=1):.1f}"
+    if len(scores) == 1:
+        return f"{scores[0]:.1f} (1)"
+    return f"{scores.mean():.1f} ± {scores.std(ddof=1):.1f} ({len(scores)})"
+
+
+def difference(scores, others):
+    """The difference of two means and its standard error, bold where it is more than
+    two of them."""
+    if min(len(scores), len(others)) < 2:
+        return "-"
+    mean = scores.mean() - others.mean()
+    error = np.hypot(stats.sem(scores), stats.sem(others))
+    text = f"{mean:.1f} ± {error:.1f}"
+    return f"**{text}**" if abs(mean) > 2 * error else text
+
+
+def interquartile_mean(*tasks, axis=-1):
+    return stats.trim_mean(np.concatenate(tasks, axis=axis), 0.25, axis=axis)
+
+
+def interquartile_mean_and_interval(tasks):
+    """The interquartile mean of all scores of some tasks, arrays (seeds,), and its 95%
+    interval by the stratified bootstrap (Agarwal et al., NeurIPS 2021): the seeds of
+    each task are drawn anew."""
+    low, high = stats.bootstrap(
+        tasks, interquartile_mean, method="percentile", n_resamples=20_000, rng=0
+    ).confidence_interval
+    return f"{interquartile_mean(*tasks):.1f} [{low:.1f}, {high:.1f}]"
 
 
 def paper_value(system, task):
@@ -162,25 +199,48 @@ def paper_value(system, task):
     return PAPER[system].split()[TASKS.index(task)]
 
 
-def table(runs, names, systems, tasks):
-    """A Markdown table: for each system its last evaluation, the mean of its last ten,
-    the number of seeds and the paper's value."""
-    header = ["task", "steps"]
-    for system in systems:
-        header += [f"{STYLES[system][0]}: last", "last ten", "seeds", "paper"]
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+def markdown(header, rows):
+    lines = [header, ["---"] * len(header), *rows]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def steps_of(runs, systems, task):
+    """How long the runs of a task are, such as "10,000" or "10,000 to 20,000" steps."""
+    last_steps = {
+        int(columns["step"][-1])
+        for system in systems
+        for columns in runs.get((system, task), {}).values()
+    }
+    ends = sorted({min(last_steps), max(last_steps)})
+    return " to ".join(f"{step:,}" for step in ends)
+
+
+def tables(runs, names, systems, tasks):
+    """Three tables in Markdown: our scores, the differences between the first system
+    and the others, and the paper's scores."""
+    labels = [STYLES[system][0] for system in systems]
+    ours, differences, papers = [], [], []
+    of_complete_tasks = []
     for task in tasks:
-        cells, steps = [], set()
-        for system in systems:
-            seeds = runs.get((system, task), {}).values()
-            steps |= {int(columns["step"][-1]) for columns in seeds}
-            scores = [columns["normalized_score"] for columns in seeds]
-            cells += [mean_and_std([score[-1] for score in scores])]
-            cells += [mean_and_std([score[-10:].mean() for score in scores])]
-            cells += [str(len(scores)), paper_value(system, task)]
-        steps = " to ".join(f"{step:,}" for step in sorted({min(steps), max(steps)}))
-        lines.append("| " + " | ".join([names[task], steps, *cells]) + " |")
-    return "\n".join([*lines, ""])
+        scores = [final_scores(runs, system, task) for system in systems]
+        steps = steps_of(runs, systems, task)
+        ours.append([names[task], steps, *map(mean_and_std, scores)])
+        first, *others = scores
+        differences.append([names[task], *(difference(first, x) for x in others)])
+        papers.append([task, *(paper_value(system, task) for system in systems)])
+        if min(map(len, scores)) >= 3:
+            of_complete_tasks.append(scores)
+    if len(of_complete_tasks) > 1:
+        by_system = zip(*of_complete_tasks, strict=True)
+        cells = [interquartile_mean_and_interval(scores) for scores in by_system]
+        title = f"interquartile mean of {len(of_complete_tasks)} tasks"
+        ours.append([title, "", *cells])
+    minus = [f"{labels[0]} - {label}" for label in labels[1:]]
+    return [
+        markdown(["task", "steps", *labels], ours),
+        markdown(["task", *minus], differences),
+        markdown(["the paper's", *labels], papers),
+    ]
 
 
 def draw_panel(axis, runs, systems, task, column):
@@ -238,6 +298,13 @@ def draw_figure(path, runs, names, systems, tasks, columns):
     plt.close(figure)
 
 
+def shown_tasks(runs, systems, tasks):
+    """The tasks of an experiment: those with a run of one of its systems or, where it
+    compares weights, of one of the other weights."""
+    weights = [system for system in systems if system.startswith("wpc-")]
+    return [t for t in tasks if any((s, t) in runs for s in weights or systems)]
+
+
 def report(args):
     runs, versions, names = read_runs(args.runs)
     if args.tasks:
@@ -251,18 +318,21 @@ def report(args):
     known = [task for task in TASKS if task in names]
     tasks = known + sorted(names.keys() - set(TASKS))
     text = [
-        "Normalized scores, mean ± sample standard deviation (ddof = 1) over seeds: "
-        "the last evaluation, and the mean of the last ten. The paper's values are "
-        "from 5 seeds and 1,000,000 steps on D4RL's files.\n",
+        "Normalized scores on our data: the mean of the last ten evaluations, mean ± "
+        "sample standard deviation over seeds (their number). The interquartile mean "
+        "is over the runs of all tasks with three seeds of each system; in brackets, "
+        "its 95% interval by a bootstrap that is stratified by task. Differences: ± "
+        "their standard error, bold where they are more than two of these. The paper's "
+        "scores are from D4RL's files, 1,000,000 steps and five seeds.\n",
     ]
-    for title in ("table1", "table2", "figure4"):
-        systems, own_tasks = EXPERIMENTS[title]
-        shown = [task for task in tasks if any((s, task) in runs for s in systems)]
-        if title == "figure4":
-            shown = [task for task in shown if task in own_tasks]
-        if shown:
-            heading = title.replace("e", "e ", 1).capitalize()
-            text += [f"## {heading}\n", table(runs, names, systems, shown)]
+    for experiment, (systems, _) in EXPERIMENTS.items():
+        shown = shown_tasks(runs, systems, tasks)
+        if not shown:
+            continue
+        heading = experiment.replace("e", "e ", 1).capitalize()
+        text += [f"## {heading}\n", *tables(runs, names, systems, shown)]
+        for figure, columns in FIGURES[experiment].items():
+            draw_figure(args.out / figure, runs, names, systems, shown, columns)
     for (system, task), scripts in versions.items():
         if task in names and len(scripts) > 1:
             text.append(
@@ -270,18 +340,6 @@ def report(args):
                 "different versions of the script.\n"
             )
     (args.out / "tables.md").write_text("\n".join(text))
-
-    def draw(name, systems, tasks, columns):
-        draw_figure(args.out / name, runs, names, systems, tasks, columns)
-
-    draw("figure2.png", EXPERIMENTS["table1"][0], tasks, ["normalized_score"])
-    draw("figure3.png", EXPERIMENTS["table1"][0], tasks, ["q"])
-    systems, own_tasks = EXPERIMENTS["figure4"]
-    shown = [task for task in tasks if task in own_tasks]
-    draw("figure4.png", systems, shown, ["q", "normalized_score"])
-    others = {"wpc-exponential", "wpc-random"}
-    shown = [task for task in tasks if any((s, task) in runs for s in others)]
-    draw("figure5.png", EXPERIMENTS["table2"][0], shown, ["normalized_score"])
     print("\n".join(text) + f"\nwritten to {args.out}/")
 
 
