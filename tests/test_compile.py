@@ -7,10 +7,12 @@ for wpc.py alone, as that takes a minute.
 
 import shutil
 import signal
+import sys
 
 import pytest
 import torch
 from conftest import (
+    ROOT,
     assert_one_sentence,
     command,
     load,
@@ -69,6 +71,40 @@ def test_the_traced_step_is_the_step(monkeypatch, script, options):
     eager = twenty_steps(script, args, compiled=False)
     traced = twenty_steps(script, args, compiled=True)
     torch.testing.assert_close(traced, eager, rtol=1e-9, atol=1e-12)
+
+
+PREPARE = """
+import sys
+import torch
+import torch._inductor.config
+from torch._inductor.compile_fx import compile_fx
+
+sys.path.insert(0, "tests")
+from test_compile import twenty_steps, wpc
+
+
+def run_graph(graph, *_, **__):
+    return graph.forward
+
+
+def prepare(graph, inputs):
+    return compile_fx(graph, inputs, inner_compile=run_graph)
+
+
+real_compile = torch.compile
+torch.compile = lambda f, options, **others: real_compile(f, backend=prepare, **others)
+torch._inductor.config.fallback_random = True
+args = wpc.Args(alpha=2.5, weight="random", policy_freq=1)
+eager, prepared = (twenty_steps(wpc, args, compiled) for compiled in (False, True))
+torch.testing.assert_close(prepared, eager, rtol=1e-9, atol=1e-12)
+"""
+
+
+def test_pytorchs_compiler_takes_the_random_weight():
+    """All that it does before it writes C++, in a process of its own, as it leaves
+    settings behind. On an index by randperm, plain as it is, it fails."""
+    process = run(sys.executable, "-c", PREPARE, cwd=ROOT)
+    assert process.returncode == 0, process.stderr
 
 
 def test_a_continued_adam_has_the_same_powers_of_its_betas(script):
