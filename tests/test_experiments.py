@@ -127,7 +127,7 @@ def test_the_interquartile_mean_and_its_interval():
 def test_scripts_of_different_content_are_told_apart(tmp_path):
     """Two seeds of each system: wBC's runs are of one script, wPC's are of two."""
     runs = ROOT / "tests/results"
-    for system, hashes in (("wbc", "aa"), ("wpc", "ab")):
+    for system, hashes in (("wbc", ["aa", "aa"]), ("wpc", ["aa", "bb"])):
         for seed, sha256 in enumerate(hashes):
             run_dir = tmp_path / f"{system}__{TASK}__{seed}"
             shutil.copytree(runs / f"{system}__{TASK}__{seed}", run_dir)
@@ -138,7 +138,10 @@ def test_scripts_of_different_content_are_told_apart(tmp_path):
     notes = [x for x in process.stdout.splitlines() if "versions of the script" in x]
     assert len(notes) == 1 and notes[0].startswith("wPC on halfcheetah-medium-replay")
     assert "of 2 different versions" in notes[0]
-    assert notes[0] in (tmp_path / "tables.md").read_text()
+    text = (tmp_path / "tables.md").read_text()
+    assert notes[0] in text
+    for row in ("wBC | aa", "wPC | aa", "wPC | bb"):
+        assert f"| {row} | {TASK} |" in text
 
 
 def test_a_report_without_runs(tmp_path):

@@ -243,6 +243,19 @@ def tables(runs, names, systems, tasks):
     ]
 
 
+def versions_table(versions):
+    """A Markdown table: the version of the script that each system's runs are of."""
+    tasks = {}
+    for (system, task), scripts in versions.items():
+        for script in scripts:
+            tasks.setdefault((system, script), []).append(task)
+    rows = [
+        [STYLES[system][0], script[:16], ", ".join(of_script)]
+        for (system, script), of_script in sorted(tasks.items())
+    ]
+    return markdown(["system", "SHA-256 of its script", "tasks"], rows)
+
+
 def draw_panel(axis, runs, systems, task, column):
     """The mean over seeds of a column, with a standard deviation on each side. Dotted:
     the score that the paper ends with."""
@@ -314,6 +327,7 @@ def report(args):
             f"{args.runs} holds no run folders <system>__<task>__<seed> with "
             "evaluations: run what `list` prints"
         )
+    versions = {key: scripts for key, scripts in versions.items() if key[1] in names}
     args.out.mkdir(parents=True, exist_ok=True)
     known = [task for task in TASKS if task in names]
     tasks = known + sorted(names.keys() - set(TASKS))
@@ -333,8 +347,9 @@ def report(args):
         text += [f"## {heading}\n", *tables(runs, names, systems, shown)]
         for figure, columns in FIGURES[experiment].items():
             draw_figure(args.out / figure, runs, names, systems, shown, columns)
+    text += ["## Scripts\n", versions_table(versions)]
     for (system, task), scripts in versions.items():
-        if task in names and len(scripts) > 1:
+        if len(scripts) > 1:
             text.append(
                 f"{STYLES[system][0]} on {names[task]}: its runs are of {len(scripts)} "
                 "different versions of the script.\n"
