@@ -158,22 +158,39 @@ def test_the_report_on_the_results(tmp_path):
     assert made == (results / "tables.md").read_text()
 
 
-def test_the_table_of_runs_that_run_away(tmp_path):
-    """It is the stored one, and by hand for a setting of two seeds."""
-    program = [sys.executable, ROOT / "tests/tools/runaway.py"]
+RUNAWAY = [sys.executable, ROOT / "tests/tools/runaway.py"]
+
+
+def test_the_stored_table_of_runs_that_run_away(tmp_path):
     stored = ROOT / "tests/results/runaway"
     copy = shutil.copytree(stored, tmp_path / "copy")
     (copy / "table.md").unlink()
-    assert run(*program, "--runs", copy, "--best-return", 262).returncode == 0
+    (copy / "figure.png").unlink()
+    process = run(*RUNAWAY, "--runs", copy)
+    assert process.returncode == 0, process.stderr
     assert (copy / "table.md").read_text() == (stored / "table.md").read_text()
+    assert (copy / "figure.png").stat().st_size > 10_000
 
-    for seed, q in enumerate((15, 25)):
-        run_dir = tmp_path / f"small/alpha1/wpc__task__{seed}"
+
+def test_a_table_of_runs_that_run_away_by_hand(tmp_path):
+    """Two seeds of alpha 2.5, of which one runs away, and one seed of alpha 10."""
+    for name, alpha, q in (("0", 2.5, 15), ("1", 2.5, 25), ("2", 10.0, 21)):
+        run_dir = tmp_path / f"data/{alpha}/wpc__task__{name}"
         run_dir.mkdir(parents=True)
-        (run_dir / "evaluations.csv").write_text(f"step,q\n10000,5\n20000,{q}\n")
-    process = run(*program, "--runs", tmp_path / "small", "--best-return", 10)
-    last = process.stdout.splitlines()[-1]
-    assert last == "| alpha1 | 0.50, 0.50 | 1.50, 2.50 |  | 1 of 2 seeds |"
+        rows = f"step,q,normalized_score\n1000,5,0\n2000,{q},{q + 1}\n"
+        (run_dir / "evaluations.csv").write_text(rows)
+        (run_dir / "args.json").write_text(json.dumps({"alpha": alpha}))
+        start = {"dataset_sha256": "aa"}
+        if alpha == 10:  # the others did not record it
+            start["best_discounted_return"] = 10
+        line = json.dumps(start)
+        (run_dir / "provenance.jsonl").write_text(f"{line}\n{line}\n")
+    process = run(*RUNAWAY, "--runs", tmp_path)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.splitlines()[2:] == [
+        "| data | 2.5 | 2,000 | 1.50, 2.50 | never; 2,000 | 16.0, 26.0 |",
+        "| data | 10.0 | 2,000 | 2.10 | 2,000 | 22.0 |",
+    ]
     (tmp_path / "none").mkdir()
-    process = run(*program, "--runs", tmp_path / "none", "--best-return", 1)
-    assert_one_sentence(process, "holds no folders with runs")
+    process = run(*RUNAWAY, "--runs", tmp_path / "none")
+    assert_one_sentence(process, "holds no run folders")

@@ -1,58 +1,133 @@
 # SPDX-License-Identifier: MIT
-"""When does Q run away? A table of Q over the dataset's best discounted return.
+"""When does Q run away? Q over the dataset's best discounted return, run by run.
 
-    python tests/tools/runaway.py --runs tests/results/runaway --best-return 262
+    python tests/tools/runaway.py --runs tests/results/runaway
 
-The folder holds a folder for each setting, with a run folder for each seed in it. The
-best discounted return is a dataset's own: a script prints it when it warns.
+The folder holds run folders <dataset>/<anything>/<run>; the runs on a dataset that have
+the same alpha are its seeds. Writes table.md and figure.png beside them.
 """
 
 import csv
+import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
 import tyro
 
-STEPS = (10_000, 20_000, 30_000)
+THRESHOLD = 2  # that of the scripts' warning
 
 
 @dataclass
 class Args:
     runs: Path
-    """folder with a folder for each setting"""
-    best_return: float
-    """best discounted return in the dataset"""
+    """folder of the run folders"""
 
 
-def q_over_best(run_dir, best_return):
-    """{step: Q over the best return} of a run's evaluations."""
-    with (run_dir / "evaluations.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    return {int(row["step"]): float(row["q"]) / best_return for row in rows}
+def starts(run_dir):
+    lines = (run_dir / "provenance.jsonl").read_text().splitlines()
+    return [json.loads(line) for line in lines]
 
 
-def table(args):
-    """A Markdown table: a row for each setting, the seeds side by side."""
-    header = ["setting", *(f"{step:,}" for step in STEPS), "over 2 at the end"]
+def best_returns(run_dirs):
+    """Best discounted returns by the SHA-256 of their datasets. The first runs did not
+    record them, so we look at all runs."""
+    key = "best_discounted_return"
+    return {
+        start["dataset_sha256"]: start[key]
+        for run_dir in run_dirs
+        for start in starts(run_dir)
+        if key in start
+    }
+
+
+def read_runs(folder):
+    """The runs of a folder by dataset and alpha, each run as its steps, Q over the best
+    discounted return, and scores: arrays (evaluations,)."""
+    run_dirs = [path.parent for path in sorted(folder.glob("*/*/*/evaluations.csv"))]
+    best = best_returns(run_dirs)
+    runs = {}
+    for run_dir in run_dirs:
+        rows = list(csv.DictReader((run_dir / "evaluations.csv").open()))
+        steps, q, scores = (
+            np.array([float(row[column]) for row in rows])
+            for column in ("step", "q", "normalized_score")
+        )
+        ratios = q / best[starts(run_dir)[0]["dataset_sha256"]]
+        alpha = json.loads((run_dir / "args.json").read_text())["alpha"]
+        key = run_dir.parts[-3], alpha
+        runs.setdefault(key, []).append((steps, ratios, scores))
+    return dict(sorted(runs.items()))
+
+
+def first_over(steps, ratios):
+    """The first evaluation with Q over the threshold, such as "20,000"."""
+    over = steps[ratios > THRESHOLD]
+    return f"{over[0]:,.0f}" if len(over) else "never"
+
+
+def table(runs):
+    """A Markdown table: a row for each dataset and alpha, the seeds side by side."""
+    header = ["dataset", "alpha", "steps", "Q / best return", "over 2 from", "score"]
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    for setting in sorted(path for path in args.runs.iterdir() if path.is_dir()):
-        folders = sorted(setting.glob("*__*__*"))
-        seeds = [q_over_best(folder, args.best_return) for folder in folders]
-        cells = [setting.name]
-        for step in STEPS:
-            cells.append(", ".join(f"{q[step]:.2f}" for q in seeds if step in q))
-        far = sum(q[max(q)] > 2 for q in seeds)
-        cells.append(f"{far} of {len(seeds)} seeds")
-        lines.append("| " + " | ".join(cells) + " |")
+    for (dataset, alpha), seeds in runs.items():
+        last_steps = sorted({int(steps[-1]) for steps, _, _ in seeds})
+        row = [
+            dataset,
+            str(alpha),
+            ", ".join(f"{step:,}" for step in last_steps),
+            ", ".join(f"{ratios[-1]:.2f}" for _, ratios, _ in seeds),
+            "; ".join(first_over(steps, ratios) for steps, ratios, _ in seeds),
+            ", ".join(f"{scores[-1]:.1f}" for _, _, scores in seeds),
+        ]
+        lines.append("| " + " | ".join(row) + " |")
     return "\n".join(lines) + "\n"
 
 
+def draw(path, runs):
+    """A panel for each dataset, a colour for each alpha, a line for each seed."""
+    datasets = sorted({dataset for dataset, _ in runs})
+    alphas = sorted({alpha for _, alpha in runs})
+    shades = plt.cm.viridis(np.linspace(0.85, 0, len(alphas)))
+    colors = dict(zip(alphas, shades, strict=True))
+    figure, axes = plt.subplots(
+        1,
+        len(datasets),
+        figsize=(3.6 * len(datasets), 3.2),
+        sharey=True,
+        squeeze=False,
+        layout="constrained",
+    )
+    for axis, dataset in zip(axes.flat, datasets, strict=True):
+        for (of_dataset, alpha), seeds in runs.items():
+            if of_dataset != dataset:
+                continue
+            for seed, (steps, ratios, _) in enumerate(seeds):
+                label = None if seed else f"{alpha}"
+                axis.plot(steps / 1000, ratios, color=colors[alpha], label=label)
+        axis.axhline(THRESHOLD, color="black", linestyle=":", linewidth=1)
+        axis.set_yscale("log")
+        axis.set_title(dataset, fontsize="medium")
+        axis.set_xlabel("training steps (thousands)")
+        axis.grid(alpha=0.3)
+        axis.legend(title="alpha", fontsize="small", title_fontsize="small")
+    axes[0, 0].set_ylabel("Q / best discounted return")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
 def main(args: Args):
-    text = table(args)
-    if text.count("\n") == 2:
-        sys.exit(f"{args.runs} holds no folders with runs")
+    runs = read_runs(args.runs)
+    if not runs:
+        sys.exit(f"{args.runs} holds no run folders <dataset>/<anything>/<run>")
+    text = table(runs)
     (args.runs / "table.md").write_text(text)
+    draw(args.runs / "figure.png", runs)
     print(text, end="")
 
 
