@@ -150,12 +150,20 @@ def test_a_report_without_runs(tmp_path):
 
 
 def test_the_report_on_the_results(tmp_path):
-    """What is stored in tests/results is what the report makes of the runs there."""
+    """What is stored in tests/results is what the report makes of the runs there, and
+    the README has its scores."""
     results = ROOT / "tests/results"
     process = run(*PROGRAM, "report", "--runs", results, "--out", tmp_path)
     assert process.returncode == 0, process.stderr
     made = (tmp_path / "tables.md").read_text()
     assert made == (results / "tables.md").read_text()
+    readme = (ROOT / "README.md").read_text()
+    rows = [
+        line for line in made.split("## Table 2")[0].splitlines() if "0,000 |" in line
+    ]
+    assert len(rows) == 4
+    for row in rows:
+        assert row.replace(" (not D4RL's file)", "") in readme
 
 
 RUNAWAY = [sys.executable, ROOT / "tests/tools/runaway.py"]

@@ -13,12 +13,10 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from experiments import markdown
 
 THRESHOLD = 2  # that of the scripts' warning
 
@@ -74,7 +72,7 @@ def first_over(steps, ratios):
 def table(runs):
     """A Markdown table: a row for each dataset and alpha, the seeds side by side."""
     header = ["dataset", "alpha", "steps", "Q / best return", "over 2 from", "score"]
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    rows = []
     for (dataset, alpha), seeds in runs.items():
         last_steps = sorted({int(steps[-1]) for steps, _, _ in seeds})
         row = [
@@ -85,8 +83,8 @@ def table(runs):
             "; ".join(first_over(steps, ratios) for steps, ratios, _ in seeds),
             ", ".join(f"{scores[-1]:.1f}" for _, _, scores in seeds),
         ]
-        lines.append("| " + " | ".join(row) + " |")
-    return "\n".join(lines) + "\n"
+        rows.append(row)
+    return markdown(header, rows)
 
 
 def draw(path, runs):
