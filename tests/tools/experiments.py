@@ -290,13 +290,16 @@ def draw_figure(path, runs, names, systems, tasks, columns):
     panels = [(task, column) for task in tasks for column in columns]
     if not panels:
         return
-    labels = {"normalized_score": "normalized score", "q": "Q(s, a), mean over a batch"}
+    labels = {
+        "normalized_score": "normalized score (dotted: the paper's)",
+        "q": "Q(s, a), mean over a batch",
+    }
     width = min(len(panels), 3)
     height = -(-len(panels) // width)
     figure, axes = plt.subplots(
         height,
         width,
-        figsize=(4.2 * width, 3.2 * height),
+        figsize=(4.4 * width, 4.0 * height),
         squeeze=False,
         layout="constrained",
     )
@@ -304,7 +307,15 @@ def draw_figure(path, runs, names, systems, tasks, columns):
         draw_panel(axis, runs, systems, task, column)
         axis.set_title(names[task], fontsize="medium")
         axis.set_ylabel(labels[column])
-        axis.legend(title="system (seeds)", fontsize="small", title_fontsize="small")
+        axis.legend(
+            title="system (seeds)",
+            fontsize="small",
+            title_fontsize="small",
+            frameon=False,
+            ncols=3,
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.18),  # below the panel: over no curve
+        )
     for axis in axes.flat[len(panels) :]:
         axis.remove()
     figure.savefig(path, dpi=130)
