@@ -4,6 +4,7 @@
 import csv
 import itertools
 import json
+import re
 import shlex
 import shutil
 import subprocess
@@ -158,12 +159,14 @@ def test_the_report_on_the_results(tmp_path):
     made = (tmp_path / "tables.md").read_text()
     assert made == (results / "tables.md").read_text()
     readme = (ROOT / "README.md").read_text()
-    rows = [
-        line for line in made.split("## Table 2")[0].splitlines() if "0,000 |" in line
-    ]
-    assert len(rows) == 4
-    for row in rows:
+    scores, *_ = made.split("## Table 1\n\n")[1].split("\n\n")
+    for row in scores.splitlines()[2:]:
         assert row.replace(" (not D4RL's file)", "") in readme
+    results_section = readme.split("## Results")[1].split("## ")[0]
+    with_errors = re.findall(r"\d+\.\d ± \d+\.\d", results_section)
+    assert len(with_errors) > 10
+    for number in with_errors:
+        assert number in made, number
 
 
 RUNAWAY = [sys.executable, ROOT / "tests/tools/runaway.py"]
