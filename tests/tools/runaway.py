@@ -27,36 +27,24 @@ class Args:
     """folder of the run folders"""
 
 
-def starts(run_dir):
-    lines = (run_dir / "provenance.jsonl").read_text().splitlines()
-    return [json.loads(line) for line in lines]
-
-
-def best_returns(run_dirs):
-    """Best discounted returns by the SHA-256 of their datasets. The first runs did not
-    record them, so we look at all runs."""
-    key = "best_discounted_return"
-    return {
-        start["dataset_sha256"]: start[key]
-        for run_dir in run_dirs
-        for start in starts(run_dir)
-        if key in start
-    }
+def best_discounted_return(run_dir):
+    """That of the run's dataset, as the run's first start recorded it."""
+    first_start, *_ = (run_dir / "provenance.jsonl").read_text().splitlines()
+    return json.loads(first_start)["best_discounted_return"]
 
 
 def read_runs(folder):
     """The runs of a folder by dataset and alpha, each run as its steps, Q over the best
     discounted return, and scores: arrays (evaluations,)."""
-    run_dirs = [path.parent for path in sorted(folder.glob("*/*/*/evaluations.csv"))]
-    best = best_returns(run_dirs)
     runs = {}
-    for run_dir in run_dirs:
-        rows = list(csv.DictReader((run_dir / "evaluations.csv").open()))
+    for path in sorted(folder.glob("*/*/*/evaluations.csv")):
+        run_dir = path.parent
+        rows = list(csv.DictReader(path.open()))
         steps, q, scores = (
             np.array([float(row[column]) for row in rows])
             for column in ("step", "q", "normalized_score")
         )
-        ratios = q / best[starts(run_dir)[0]["dataset_sha256"]]
+        ratios = q / best_discounted_return(run_dir)
         alpha = json.loads((run_dir / "args.json").read_text())["alpha"]
         key = run_dir.parts[-3], alpha
         runs.setdefault(key, []).append((steps, ratios, scores))
