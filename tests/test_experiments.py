@@ -163,10 +163,11 @@ def test_the_report_on_the_results(tmp_path):
     for row in scores.splitlines()[2:]:
         assert row.replace(" (not D4RL's file)", "") in readme
     results_section = readme.split("## Results")[1].split("## ")[0]
-    with_errors = re.findall(r"\d+\.\d ± \d+\.\d", results_section)
-    assert len(with_errors) > 10
-    for number in with_errors:
-        assert number in made, number
+    with_error = re.compile(r"-?\d+\.\d ± \d+\.\d")
+    numbers = with_error.findall(results_section)
+    assert len(numbers) > 10
+    for number in numbers:
+        assert number in with_error.findall(made), number
 
 
 RUNAWAY = [sys.executable, ROOT / "tests/tools/runaway.py"]

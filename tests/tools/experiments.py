@@ -11,6 +11,7 @@
 
 import csv
 import json
+import math
 import shlex
 import sys
 from dataclasses import dataclass, field
@@ -259,6 +260,11 @@ def versions_table(versions):
 def draw_panel(axis, runs, systems, task, column):
     """The mean over seeds of a column, with a standard deviation on each side. Dotted:
     the score that the paper ends with."""
+    labels = {
+        "normalized_score": "normalized score",
+        "q": "Q(s, a), mean over a batch",
+    }
+    axis.set_ylabel(labels[column])
     for system in systems:
         seeds = list(runs.get((system, task), {}).values())
         if not seeds:
@@ -280,6 +286,7 @@ def draw_panel(axis, runs, systems, task, column):
         paper = paper_value(system, task)
         if column == "normalized_score" and paper != "-":
             axis.axhline(float(paper), linestyle=":", color=color, linewidth=1)
+            axis.set_ylabel("normalized score (dotted: the paper's)")
     axis.set_xlabel("training steps (thousands)")
     axis.grid(alpha=0.3)
 
@@ -290,12 +297,8 @@ def draw_figure(path, runs, names, systems, tasks, columns):
     panels = [(task, column) for task in tasks for column in columns]
     if not panels:
         return
-    labels = {
-        "normalized_score": "normalized score (dotted: the paper's)",
-        "q": "Q(s, a), mean over a batch",
-    }
-    width = min(len(panels), 3)
-    height = -(-len(panels) // width)
+    height = math.ceil(len(panels) / 3)
+    width = math.ceil(len(panels) / height)
     figure, axes = plt.subplots(
         height,
         width,
@@ -306,7 +309,6 @@ def draw_figure(path, runs, names, systems, tasks, columns):
     for axis, (task, column) in zip(axes.flat, panels, strict=False):
         draw_panel(axis, runs, systems, task, column)
         axis.set_title(names[task], fontsize="medium")
-        axis.set_ylabel(labels[column])
         axis.legend(
             title="system (seeds)",
             fontsize="small",
