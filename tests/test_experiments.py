@@ -173,8 +173,9 @@ def test_the_report_on_the_results(tmp_path):
 RUNAWAY = [sys.executable, ROOT / "tests/tools/runaway.py"]
 
 
-def test_the_stored_table_of_runs_that_run_away(tmp_path):
-    stored = ROOT / "tests/results/runaway"
+@pytest.mark.parametrize("folder", ["runaway", "runaway_150000"])
+def test_the_stored_tables_of_runs_that_run_away(tmp_path, folder):
+    stored = ROOT / "tests/results" / folder
     copy = shutil.copytree(stored, tmp_path / "copy")
     (copy / "table.md").unlink()
     (copy / "figure.png").unlink()
