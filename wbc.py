@@ -811,8 +811,8 @@ def restore(agent, checkpoint):
 
 
 def q_runs_away(q, best_discounted_return):
-    """Whether Q is far above what the dataset shows to be possible."""
-    return q > 2 * abs(best_discounted_return)
+    """Whether Q is well above what the dataset shows to be possible."""
+    return q > 1.2 * abs(best_discounted_return)
 
 
 def catch_stop_signals():
@@ -894,8 +894,8 @@ def train(args):
                 if q_runs_away(metrics["q"], best_return) and not warned:
                     warned = True
                     tqdm.write(
-                        f"step {step:,}: Q is over twice the dataset's best discounted "
-                        f"return, {best_return:.0f}, and may be running away"
+                        f"step {step:,}: Q is over 1.2 times the dataset's best "
+                        f"discounted return, {best_return:.0f}, and may be running away"
                     )
             if eval_is_due:
                 returns = evaluate(envs, agent.actor, mean, std, args.seed)
