@@ -258,8 +258,8 @@ def versions_table(versions):
 
 
 def draw_panel(axis, runs, systems, task, column):
-    """The mean over seeds of a column, with a standard deviation on each side. Dotted:
-    the score that the paper ends with."""
+    """The mean over seeds of a column, with a standard deviation on each side; where Q
+    runs away, its median and range. Dotted: the score that the paper ends with."""
     labels = {
         "normalized_score": "normalized score",
         "q": "Q(s, a), mean over a batch",
@@ -274,15 +274,14 @@ def draw_panel(axis, runs, systems, task, column):
         steps = seeds[0]["step"][:length] / 1000
         values = np.stack([columns[column][:length] for columns in seeds])
         mean = values.mean(axis=0)
-        axis.plot(
-            steps, mean, linestyle=line, color=color, label=f"{label} ({len(seeds)})"
-        )
-        if len(seeds) > 1:
-            std = values.std(axis=0, ddof=1)
-            area = {"color": color, "alpha": 0.2, "linewidth": 0}
-            axis.fill_between(steps, mean - std, mean + std, **area)
-        if column == "q" and np.nanmax(mean) > 10_000:  # Q runs away
+        std = values.std(axis=0, ddof=1) if len(seeds) > 1 else 0
+        middle, low, high = mean, mean - std, mean + std
+        if column == "q" and values.max() > 10_000:  # Q runs away, some seeds' by far
             axis.set_yscale("log")
+            middle, low, high = np.percentile(values, [50, 0, 100], axis=0)
+        label = f"{label} ({len(seeds)})"
+        axis.plot(steps, middle, linestyle=line, color=color, label=label)
+        axis.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
         paper = paper_value(system, task)
         if column == "normalized_score" and paper != "-":
             axis.axhline(float(paper), linestyle=":", color=color, linewidth=1)

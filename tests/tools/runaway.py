@@ -84,14 +84,13 @@ def draw(path, runs):
     alphas = sorted({alpha for _, alpha in runs})
     shades = plt.cm.viridis(np.linspace(0.85, 0, len(alphas)))
     colors = dict(zip(alphas, shades, strict=True))
-    plt.rcParams["axes.formatter.min_exponent"] = 3  # 0.5, not 5 x 10^-1
+    plt.rcParams["axes.formatter.min_exponent"] = 6  # 0.5, not 5 x 10^-1
     height = math.ceil(len(datasets) / 3)
     width = math.ceil(len(datasets) / height)
     figure, axes = plt.subplots(
         height,
         width,
         figsize=(3.6 * width, 3.2 * height),
-        sharey=True,
         squeeze=False,
         layout="constrained",
     )
