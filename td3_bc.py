@@ -774,14 +774,24 @@ def training_state(agent):
     }
 
 
-def restore(agent, checkpoint):
-    """Puts an agent and the random numbers into a checkpoint's `training_state`."""
+def resume(agent, run_dir, dataset_sha256):
+    """Puts the agent and the random numbers where the run folder's checkpoint has them.
+
+    Returns its step, metrics and evaluations; step 0 if there is no checkpoint yet.
+    Exits with a sentence if it can't be loaded, or is of another dataset.
+    """
+    checkpoint = load_checkpoint(run_dir)
+    if checkpoint is None:
+        return 0, {}, []
+    if checkpoint["dataset_sha256"] != dataset_sha256:
+        sys.exit(f"{run_dir} began with another dataset: name that one with --dataset")
     agent.load_state_dict(checkpoint["networks"])
     states = checkpoint["optimizers"]
     for optimizer, state in zip(agent.optimizers, states, strict=True):
         optimizer.load_state_dict(state)
     torch.set_rng_state(checkpoint["rng_state"])
     torch.cuda.set_rng_state_all(checkpoint["cuda_rng_states"])
+    return checkpoint["step"], checkpoint["metrics"], checkpoint["evaluations"]
 
 
 def q_runs_away(q, best_discounted_return):
@@ -823,18 +833,8 @@ def train(args):
     torch.manual_seed(args.seed)  # again: the batches depend on no network
 
     run_dir, _lock = open_run_dir(args)
-    step, metrics, evaluations = 0, {}, []
     sha256 = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    checkpoint = load_checkpoint(run_dir)
-    if checkpoint is not None:
-        if checkpoint["dataset_sha256"] != sha256:
-            sys.exit(
-                f"{path} is not the dataset that {run_dir} began with: name that one"
-            )
-        restore(agent, checkpoint)
-        step = checkpoint["step"]
-        metrics = checkpoint["metrics"]
-        evaluations = checkpoint["evaluations"]
+    step, metrics, evaluations = resume(agent, run_dir, sha256)
 
     def save_checkpoint():
         check_finite(agent, metrics, step)
