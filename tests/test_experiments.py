@@ -173,7 +173,7 @@ def test_the_report_on_the_results(tmp_path):
 RUNAWAY = [sys.executable, ROOT / "tests/tools/runaway.py"]
 
 
-@pytest.mark.parametrize("folder", ["runaway", "runaway_150000"])
+@pytest.mark.parametrize("folder", ["runaway", "runaway_later"])
 def test_the_stored_tables_of_runs_that_run_away(tmp_path, folder):
     stored = ROOT / "tests/results" / folder
     copy = shutil.copytree(stored, tmp_path / "copy")
