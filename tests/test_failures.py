@@ -261,7 +261,9 @@ def test_a_metric_or_a_parameter_that_is_not_finite(script, number):
             wpc.check_finite(agent, {}, step=7)
 
 
-@pytest.mark.parametrize("best, q, away", [(10, 13, 1), (10, 11, 0), (-10, 13, 1)])
+@pytest.mark.parametrize(
+    "best, q, away", [(10, 12.1, 1), (10, 11.9, 0), (-10, 12.1, 1)]
+)
 def test_q_runs_away_from_1_2_times_the_best_discounted_return_on(best, q, away):
     assert wpc.q_runs_away(q, best) == away
 

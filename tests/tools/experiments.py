@@ -276,7 +276,7 @@ def draw_panel(axis, runs, systems, task, column):
         mean = values.mean(axis=0)
         std = values.std(axis=0, ddof=1) if len(seeds) > 1 else 0
         middle, low, high = mean, mean - std, mean + std
-        if column == "q" and values.max() > 10_000:  # Q runs away, some seeds' by far
+        if column == "q" and values.max() > 10_000:  # Q runs away: seeds are far apart
             axis.set_yscale("log")
             middle, low, high = np.percentile(values, [50, 0, 100], axis=0)
         label = f"{label} ({len(seeds)})"
