@@ -162,7 +162,7 @@ def test_the_report_on_the_results(tmp_path):
     scores, *_ = made.split("## Table 1\n\n")[1].split("\n\n")
     for row in scores.splitlines()[2:]:
         assert row.replace(" (not D4RL's file)", "") in readme
-    results_section = readme.split("## Results")[1].split("## ")[0]
+    results_section = readme.split("\n## Results")[1].split("\n## ")[0]
     with_error = re.compile(r"-?\d+\.\d ± \d+\.\d")
     numbers = with_error.findall(results_section)
     assert len(numbers) > 10
