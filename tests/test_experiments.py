@@ -12,10 +12,11 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import DATASET, ROOT, assert_one_sentence, run
+from conftest import DATASET, ROOT, assert_one_sentence, run, wpc
 
 sys.path.insert(0, str(ROOT / "tests/tools"))
 import experiments
+import runaway
 
 PROGRAM = [sys.executable, ROOT / "tests/tools/experiments.py"]
 TASK = "halfcheetah-medium-replay-v2"
@@ -185,6 +186,11 @@ def test_the_stored_tables_of_runs_that_run_away(tmp_path, folder):
     assert (copy / "figure.png").stat().st_size > 10_000
 
 
+def test_the_tables_threshold_is_the_scripts():
+    assert wpc.q_runs_away(runaway.THRESHOLD * 10 + 0.01, 10)
+    assert not wpc.q_runs_away(runaway.THRESHOLD * 10 - 0.01, 10)
+
+
 def test_a_table_of_runs_that_run_away_by_hand(tmp_path):
     """Two seeds of alpha 2.5, of which one runs away, and one seed of alpha 10."""
     for name, alpha, q in (("0", 2.5, 11), ("1", 2.5, 25), ("2", 10.0, 13)):
@@ -198,8 +204,8 @@ def test_a_table_of_runs_that_run_away_by_hand(tmp_path):
     process = run(*RUNAWAY, "--runs", tmp_path)
     assert process.returncode == 0, process.stderr
     assert process.stdout.splitlines()[2:] == [
-        "| data | 2.5 | 2,000 | 1.10, 2.50 | never; 2,000 | 12.0, 26.0 |",
-        "| data | 10.0 | 2,000 | 1.30 | 2,000 | 14.0 |",
+        "| data | 2.5 | 2,000 | 1.10, 2.50 | never; 2,000 | 12.0, 26.0 | 6.0, 13.0 |",
+        "| data | 10.0 | 2,000 | 1.30 | 2,000 | 14.0 | 7.0 |",
     ]
     (tmp_path / "none").mkdir()
     process = run(*RUNAWAY, "--runs", tmp_path / "none")

@@ -59,9 +59,11 @@ def first_over(steps, ratios):
 
 
 def table(runs):
-    """A Markdown table: a row for each dataset and alpha, the seeds side by side."""
+    """A Markdown table: a row for each dataset and alpha, the seeds side by side. The
+    mean of the last ten evaluations is that of all where there are fewer."""
     over = f"over {THRESHOLD} from"
-    header = ["dataset", "alpha", "steps", "Q / best return", over, "score"]
+    header = ["dataset", "alpha", "steps", "Q / best return", over]
+    header += ["last score", "mean of last ten"]
     rows = []
     for (dataset, alpha), seeds in runs.items():
         last_steps = sorted({int(steps[-1]) for steps, _, _ in seeds})
@@ -72,6 +74,7 @@ def table(runs):
             ", ".join(f"{ratios[-1]:.2f}" for _, ratios, _ in seeds),
             "; ".join(first_over(steps, ratios) for steps, ratios, _ in seeds),
             ", ".join(f"{scores[-1]:.1f}" for _, _, scores in seeds),
+            ", ".join(f"{scores[-10:].mean():.1f}" for _, _, scores in seeds),
         ]
         rows.append(row)
     return markdown(header, rows)
