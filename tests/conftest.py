@@ -4,7 +4,6 @@
 import csv
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -60,12 +59,14 @@ def command(script, *arguments):
     """A short run on the dataset that ships; later arguments override these."""
     line = [sys.executable, ROOT / f"{script}.py", "--env", "halfcheetah"]
     line += ["--dataset", DATASET, "--device", "cpu", "--max-timesteps", 60]
-    line += ["--eval-freq", 30, "--eval-episodes", 2, "--log-freq", 10, *arguments]
+    line += ["--eval-freq", 30, "--eval-episodes", 2, *arguments]
     return [str(x) for x in line]
 
 
 def environment():
-    return os.environ | {"OMP_NUM_THREADS": "1"}  # two runs agree to the last bit
+    variables = os.environ | {"OMP_NUM_THREADS": "1"}  # runs agree to the last bit
+    variables.pop("PYTHONUNBUFFERED", None)  # which few users set
+    return variables
 
 
 def run(*line, **options):
@@ -107,21 +108,22 @@ def assert_one_sentence(process, sentence, code=1):
 def run_here(script, *line):
     """Runs a command line in this process, which saves the seconds of a start."""
     time.sleep(1 - time.time() % 1)  # TensorBoard's files are in order by the second
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    handlers = [signal.getsignal(number) for number in numbers]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", [str(x) for x in line[1:]])
-        script.train(script.parse_args())
-    for number, handler in zip(numbers, handlers, strict=True):
-        signal.signal(number, handler)
+        script.main()
 
 
 def refusal(script, *line):
     """The sentence with which a script refuses a command line."""
     with pytest.raises(SystemExit) as stop:
         run_here(script, *line)
-    assert isinstance(stop.value.code, str) and "\n" not in stop.value.code
-    return stop.value.code
+    sentence = str(stop.value.code)
+    assert type(stop.value.code) is not int and "\n" not in sentence
+    return sentence
+
+
+def files(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def read_rows(run_dir):
@@ -135,7 +137,7 @@ def read_rows(run_dir):
 def read_curves(run_dir):
     """TensorBoard's scalars but the speed: {tag: [(step, value), ...]}."""
     events = EventAccumulator(str(run_dir), size_guidance={"scalars": 0}).Reload()
-    tags = [tag for tag in events.Tags()["scalars"] if "steps_per_second" not in tag]
+    tags = [tag for tag in events.Tags()["scalars"] if tag != "steps_per_second"]
     return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in tags}
 
 
@@ -143,11 +145,17 @@ def load(run_dir):
     return torch.load(run_dir / "checkpoint.pt", weights_only=True)
 
 
+def networks(agent):
+    """An agent's networks, without its optimizers: {name: module}."""
+    return {k: x for k, x in vars(agent).items() if isinstance(x, torch.nn.Module)}
+
+
 def as_bits(value):
-    """A checkpoint with its tensors as bytes, which compare to the last bit."""
+    """A checkpoint with its tensors as bytes, which compare to the last bit, and
+    without what differs between equal runs: their paths and their speed."""
     if isinstance(value, dict):
-        items = value.items()
-        return {key: as_bits(v) for key, v in items if key != "steps_per_second"}
+        left_out = {"steps_per_second", "run_dir", "dataset"}
+        return {key: as_bits(v) for key, v in value.items() if key not in left_out}
     if isinstance(value, list | tuple):
         return [as_bits(v) for v in value]
     if isinstance(value, torch.Tensor):
@@ -165,7 +173,7 @@ def finished(tmp_path_factory):
     """The folder of a run of wpc.py that nothing disturbed."""
     run_dir = tmp_path_factory.mktemp("finished") / "run"
     process = run(*command("wpc", "--run-dir", run_dir))
-    assert process.returncode == 0, process.stderr
+    assert process.returncode == 0 and process.stderr == "", process.stderr
     return run_dir
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """From an HDF5 file to transitions: against a slow loop, on files good and bad."""
 
+import fcntl
 import subprocess
 import sys
 
@@ -12,34 +13,38 @@ from conftest import DATASET, ROOT, SCRIPTS, d4rl_arrays, wpc, write_hdf5
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-
-def load_dataset(path, state_dim=17, action_dim=6, script=wpc, **options):
-    args = script.Args(**{"batch_size": 1, **options})
-    return script.load_dataset(path, state_dim, action_dim, args)
+EPISODES = ROOT.parent / "shared/d4rl/episodes"
 
 
-def slow_load(arrays):
-    """d4rl.qlearning_dataset row by row: transitions by the row that they are from, and
-    the rows of each episode."""
-    transitions, episodes, episode = {}, [], []
-    rows = len(arrays["rewards"])
+def load_dataset(path, state_dim=17, action_dim=6, max_action=1.0, script=wpc, **kw):
+    args = script.Args(env="Mine-v0", dataset=str(path), **kw)
+    return script.load_dataset(path, state_dim, action_dim, max_action, args)
+
+
+def slow_load(arrays, discount):
+    """Row by row: the transitions, by the row that they are from, the rows of each
+    episode, and the best discounted return from any row on."""
+    flags = (arrays[key].ravel() > 0 for key in ("terminals", "timeouts"))
+    terminals, timeouts = map(np.ndarray.tolist, flags)
+    rewards = np.float64(np.float32(arrays["rewards"])).ravel()
+    transitions, episodes, best = {}, [[]], -np.inf
+    rows = len(rewards)
     for i in range(rows):
-        episode.append(i)
-        if not arrays["timeouts"][i] and i + 1 < rows:
-            transitions[i] = {
-                "observations": arrays["observations"][i],
-                "actions": arrays["actions"][i],
-                "rewards": arrays["rewards"][i],
-                "next_observations": arrays["observations"][i + 1],
-                "terminals": arrays["terminals"][i],
-            }
-        # A terminal row may be followed by one that only holds the last observation.
-        goes_on = i + 1 < rows and arrays["timeouts"][i + 1]
-        ends = arrays["timeouts"][i] or (arrays["terminals"][i] and not goes_on)
-        if ends or i + 1 == rows:
-            episodes.append(episode)
-            episode = []
-    return transitions, episodes
+        episodes[-1].append(i)
+        if not timeouts[i] and i + 1 < rows:
+            transitions[i] = {key: arrays[key][i] for key in KEYS if key in arrays}
+            if "next_observations" not in arrays:
+                transitions[i]["next_observations"] = arrays["observations"][i + 1]
+        if (terminals[i] or timeouts[i]) and i + 1 < rows:
+            episodes.append([])
+    for episode in episodes:
+        for i in episode:
+            rest = [discount ** (j - i) * rewards[j] for j in episode if j >= i]
+            best = max(best, sum(rest))
+    return transitions, episodes, best
+
+
+KEYS = ("observations", "actions", "rewards", "next_observations", "terminals")
 
 
 @st.composite
@@ -57,12 +62,15 @@ def files(draw):
     arrays = {
         "observations": states.astype(float_type),
         "actions": actions.astype(float_type),
-        "rewards": rng.normal(size=reward_shape).astype(float_type),
+        "rewards": rng.normal(-1, 1, reward_shape).astype(float_type),
         "terminals": np.isin(ends, ["terminal", "both"]).astype(flag_type),
         "timeouts": np.isin(ends, ["timeout", "both"]).astype(flag_type),
     }
     if draw(st.booleans()):
-        arrays["next_observations"] = np.full((rows, 1), np.nan)  # is not used
+        arrays["terminals"] = arrays["terminals"][:, None]
+        arrays["timeouts"] = arrays["timeouts"][:, None]
+    if draw(st.booleans()):
+        arrays["next_observations"] = (states + rng.normal()).astype(float_type)
         arrays |= {"infos/qpos": np.zeros((rows, 2)), "metadata/algorithm": "SAC"}
     return arrays
 
@@ -76,24 +84,30 @@ def test_random_files_load_as_in_a_slow_loop(tmp_path, arrays):
     path = write_hdf5(tmp_path / "data.hdf5", arrays)
     state_dim, action_dim = arrays["observations"].shape[1], arrays["actions"].shape[1]
     options = {"discount": 0.9, "weight": "static"}
-    expected, episodes = slow_load(arrays)
+    expected, episodes, best = slow_load(arrays, 0.9)
     if not expected:
-        with pytest.raises(SystemExit, match="has 0 transitions"):
+        with pytest.raises(SystemExit, match=r"\b0 transitions"):
             load_dataset(path, state_dim, action_dim, **options)
         return
-    dataset, discounted_returns = load_dataset(path, state_dim, action_dim, **options)
+    dataset, mean, std, best_return = load_dataset(
+        path, state_dim, action_dim, **options
+    )
+    assert best_return == pytest.approx(best, abs=1e-9)
 
-    for key in ("observations", "actions", "rewards", "next_observations", "terminals"):
+    columns = {}
+    for key in KEYS:
         column = np.array([row[key] for row in expected.values()], dtype=np.float32)
+        columns[key] = column.reshape(len(expected), -1)
+    states = np.float64(columns["observations"])
+    assert mean.numpy() == pytest.approx(states.mean(axis=0), rel=1e-6)
+    assert std.numpy() == pytest.approx(states.std(axis=0) + 1e-3, rel=1e-5)
+    for key in ("observations", "next_observations"):
+        columns[key] = (columns[key] - mean.numpy()) / std.numpy()
+    for key, column in columns.items():
         assert dataset[key].dtype == torch.float32
-        assert np.array_equal(dataset[key], column.reshape(len(expected), -1)), key
+        assert np.array_equal(dataset[key], column), key
 
-    rewards = arrays["rewards"].reshape(-1).astype(np.float32).astype(np.float64)
-    discounted = [
-        sum(rewards[i] * 0.9**t for t, i in enumerate(episode)) for episode in episodes
-    ]
-    assert discounted_returns == pytest.approx(discounted, abs=1e-9)
-
+    rewards = np.float64(np.float32(arrays["rewards"])).ravel()
     returns = [sum(rewards[i] for i in episode) for episode in episodes]
     middle = np.median(returns)
     better = {
@@ -103,6 +117,12 @@ def test_random_files_load_as_in_a_slow_loop(tmp_path, arrays):
         if total >= middle
     }
     assert dataset["better_half"][:, 0].tolist() == [i in better for i in expected]
+    assert dataset.keys() == {*KEYS, "better_half"}
+
+
+def raw(dataset, mean, std, key="observations"):
+    """The first component of states as they are in the file."""
+    return (dataset[key] * std + mean)[:, 0].numpy().round(4).tolist()
 
 
 def test_which_rows_are_dropped_by_hand(tmp_path):
@@ -110,11 +130,67 @@ def test_which_rows_are_dropped_by_hand(tmp_path):
     arrays["observations"] = np.arange(6, dtype=np.float32)[:, None]
     arrays["terminals"] = np.array([0, 0, 1, 0, 1, 0], bool)
     arrays["timeouts"] = np.array([0, 1, 0, 0, 1, 0], bool)
-    dataset, _ = load_dataset(write_hdf5(tmp_path / "data.hdf5", arrays), 1, 1)
+    path = write_hdf5(tmp_path / "data.hdf5", arrays)
+    *loaded, _ = load_dataset(path, 1, 1)
     # 1 is a timeout, 4 a timeout and terminal, 5 the last row
-    assert dataset["observations"][:, 0].tolist() == [0, 2, 3]
-    assert dataset["terminals"][:, 0].tolist() == [0, 1, 0]
-    assert dataset["next_observations"][:, 0].tolist() == [1, 3, 4]
+    assert raw(*loaded) == [0, 2, 3]
+    assert raw(*loaded, "next_observations") == [1, 3, 4]
+    assert loaded[0]["terminals"][:, 0].tolist() == [0, 1, 0]
+
+
+def test_the_best_return_by_hand(tmp_path):
+    """It may begin in the middle of an episode, and doesn't go on past an end."""
+    arrays = d4rl_arrays(9, 1, 1)
+    arrays["rewards"] = np.float32([-9, 4, 4, 5, 0, 5, -1, 6, 2])
+    cases = {  # by the row that ends an episode, and how
+        (): 4 + 0.5 * (4 + 0.5 * (5 + 0.5 * (0 + 0.5 * (5 + 0.5 * 2.5)))),
+        (2, "terminals"): 6 + 0.5 * 2,
+        (2, "timeouts"): 6 + 0.5 * 2,
+        (7, "timeouts"): 4 + 0.5 * (4 + 0.5 * (5 + 0.5 * (0 + 0.5 * (5 + 0.5 * 2)))),
+    }
+    for end, best in cases.items():
+        for key in ("terminals", "timeouts"):
+            arrays[key] = np.zeros(9, bool)
+        if end:
+            row, key = end
+            arrays[key][row] = True
+        path = write_hdf5(tmp_path / "data.hdf5", arrays)
+        assert load_dataset(path, 1, 1, discount=0.5)[-1] == pytest.approx(best), end
+
+
+def test_shuffled_and_subsampled_files_give_their_own_pairs(tmp_path):
+    states = np.float32(np.random.default_rng(0).permutation(300))[:, None]
+    arrays = d4rl_arrays(300, 1, 1) | {"observations": states}
+    arrays["next_observations"] = states + 0.5
+    shuffled = np.random.default_rng(1).permutation(300)
+    for order in (shuffled, np.arange(0, 300, 7)):
+        file = {key: column[order] for key, column in arrays.items()}
+        *loaded, _ = load_dataset(write_hdf5(tmp_path / "data.hdf5", file), 1, 1)
+        assert raw(*loaded) == states[order][:-1][~file["timeouts"][:-1], 0].tolist()
+        following = raw(*loaded, "next_observations")
+        assert following == [x + 0.5 for x in raw(*loaded)]
+
+
+@pytest.mark.skipif(
+    not EPISODES.exists(), reason=f"no episodes of D4RL's in {EPISODES}"
+)
+@pytest.mark.parametrize("robot", wpc.D4RL_ROBOTS)
+def test_d4rls_own_files_train_the_same_without_next_observations(tmp_path, robot):
+    """But for the next states of terminal rows, which don't count."""
+    arrays = dict(np.load(EPISODES / f"{robot}_medium-v2.npz"))
+    dims = arrays["observations"].shape[1], arrays["actions"].shape[1]
+    path = write_hdf5(tmp_path / "with.hdf5", arrays)
+    theirs, *facts = load_dataset(path, *dims)
+    arrays.pop("next_observations")
+    path = write_hdf5(tmp_path / "without.hdf5", arrays)
+    ours, *our_facts = load_dataset(path, *dims)
+    assert all(map(np.array_equal, facts, our_facts))
+    running = theirs["terminals"][:, 0] == 0
+    assert len(running) - running.sum() == (robot == "hopper")  # the other is the last
+    for key in KEYS:
+        same = (theirs[key] == ours[key]).all(dim=1)
+        assert same[running].all()
+        assert same.all() or key == "next_observations"
 
 
 HALVES = [([1, 3, 2], [0, 1, 1]), ([4, 1, 2, 3], [1, 0, 0, 1]), ([5, 5], [1, 1])]
@@ -127,20 +203,28 @@ def test_the_better_half_of_the_episodes(tmp_path, returns, half):
     arrays["terminals"] = np.arange(2 * len(returns)) % 2 == 1
     arrays["timeouts"] = np.zeros(2 * len(returns), bool)
     path = write_hdf5(tmp_path / "data.hdf5", arrays)
-    dataset, _ = load_dataset(path, 1, 1, weight="static")
+    dataset, *_ = load_dataset(path, 1, 1, weight="static")
     expected = np.repeat(half, 2)[:-1].tolist()  # the last row gives no transition
     assert dataset["better_half"][:, 0].tolist() == expected
     assert "better_half" not in load_dataset(path, 1, 1)[0]  # Figure 4 alone needs it
 
 
-def test_normalize_states_by_hand():
-    states = torch.tensor([[0.0, 5.0], [2.0, 5.0], [4.0, 5.0]])
-    transitions = {"observations": states.clone(), "next_observations": states + 1}
-    mean, std = wpc.normalize_states(transitions)
+def test_normalization_by_hand(tmp_path):
+    """By mean and deviation of the states that transitions start from."""
+    arrays = d4rl_arrays(5, 2, 1)
+    arrays["observations"] = np.float32([[0, 5], [2, 5], [4, 5], [90, 90], [80, 80]])
+    arrays["timeouts"][3] = True
+    path = write_hdf5(tmp_path / "data.hdf5", arrays)
+    dataset, mean, std, _ = load_dataset(path, 2, 1)
     assert mean.tolist() == [2, 5]
-    assert std.tolist() == pytest.approx([(8 / 3) ** 0.5 + 1e-3, 1e-3])
-    for key, raw in (("observations", states), ("next_observations", states + 1)):
-        assert transitions[key].numpy() == pytest.approx(((raw - mean) / std).numpy())
+    deviation = (8 / 3) ** 0.5 + 1e-3
+    assert std.tolist() == pytest.approx([deviation, 1e-3])
+    assert dataset["observations"][:, 0].numpy() == pytest.approx(
+        np.array([-2, 0, 2]) / deviation
+    )
+    assert dataset["next_observations"].numpy() == pytest.approx(
+        np.array([[0, 0], [2 / deviation, 0], [88 / deviation, 85_000]])
+    )
 
 
 def test_batches_are_uniform_with_replacement():
@@ -153,10 +237,11 @@ def test_batches_are_uniform_with_replacement():
 
 
 def test_the_scripts_load_alike():
-    ours, our_returns = load_dataset(DATASET)
+    ours, *facts = load_dataset(DATASET)
     for script in SCRIPTS.values():
-        dataset, returns = load_dataset(DATASET, script=script)
-        assert dataset.keys() == ours.keys() and (returns == our_returns).all()
+        dataset, *their_facts = load_dataset(DATASET, script=script)
+        assert dataset.keys() == ours.keys()
+        assert all(map(np.array_equal, facts, their_facts))
         assert all(torch.equal(dataset[key], ours[key]) for key in ours)
 
 
@@ -182,64 +267,115 @@ def every(change):
 
 
 BAD = [
-    (without("observations"), "has no 'observations'"),
-    (without("actions"), "has no 'actions'"),
-    (without("rewards"), "has no 'rewards'"),
-    (without("terminals"), "has no 'terminals'"),
-    (without("timeouts"), "has no 'timeouts'"),
+    (without("observations"), "has no observations"),
+    (without("actions"), "has no actions"),
+    (without("rewards"), "has no rewards"),
+    (without("terminals"), "has no terminals"),
     (
-        replaced("actions", lambda x: x[:-1]),
-        r"'actions' has shape \(39, 6\), not \(40, 6\)",
+        without("timeouts"),
+        r"has no timeouts.*\(timeouts: 1 where an episode was cut off",
     ),
-    (replaced("timeouts", lambda x: x[:-2]), r"'timeouts' has shape \(38, 1\), not"),
+    (replaced("actions", lambda x: x[:-1]), r"actions must be \(40, 6\).* \(39, 6\)"),
+    (replaced("timeouts", lambda x: x[:-2]), r"timeouts must be \(40, 1\).* \(38,\)"),
     (
         replaced("observations", lambda x: x[:, :11]),
-        r"has shape \(40, 11\), not \(40, 17\)",
+        r"observations must be \(40, 17\).* \(40, 11\)",
     ),
-    (replaced("actions", lambda x: x[:, :3]), r"'actions' has shape \(40, 3\)"),
+    (replaced("actions", lambda x: x[:, :3]), r"actions must be .* \(40, 3\)"),
     (
         replaced("rewards", lambda x: np.stack([x, x], 1)),
-        r"'rewards' has shape \(40, 2\)",
+        r"rewards must be \(40, 1\).* \(40, 2\)",
     ),
-    (replaced("terminals", lambda x: np.bool_(True)), "in D4RL's format"),
-    (replaced("rewards", lambda x: np.array([b"one"] * 40)), "in D4RL's format"),
-    (lambda a: a.update({"rewards/inner": a.pop("rewards")}), "in D4RL's format"),
-    (with_value("observations", np.nan), "'observations' holds NaN or infinite"),
-    (with_value("actions", -np.inf), "'actions' holds NaN or infinite"),
-    (with_value("rewards", 1e300), "'rewards' holds NaN or infinite"),
-    (with_value("terminals", np.nan), "'terminals' holds NaN or infinite"),
-    (every(lambda x: x[:0]), "has 0 transitions, too few"),
-    (every(lambda x: x[:1]), "has 0 transitions"),
-    (lambda a: a.update(timeouts=np.ones(40, bool)), "has 0 transitions"),
+    (
+        lambda a: a.update(next_observations=a["observations"][:-1]),
+        r"next_observations must be \(40, 17\).* \(39, 17\)",
+    ),
+    (with_value("observations", np.nan), "observations must be .* finite"),
+    (with_value("actions", -np.inf), "actions must be .* finite"),
+    (with_value("rewards", np.inf), "rewards must be .* finite"),
+    (with_value("terminals", np.nan), "terminals must be .* finite"),
+    (
+        lambda a: a.update(next_observations=np.full((40, 17), np.nan)),
+        "next_observations must be .* finite",
+    ),
+    (with_value("actions", 1.1), r"(?=.*--env Mine-v0).*actions up to 1\.1\b.*\b1\b"),
+    (with_value("actions", -5), r"(?=.*--env Mine-v0).*actions up to 5\b.*\b1\b"),
+    (every(lambda x: x[:0]), r"\b0 transitions"),
+    (every(lambda x: x[:1]), r"\b0 transitions"),
+    (lambda a: a.update(timeouts=np.ones(40, bool)), r"\b0 transitions"),
 ]
 
 
 @pytest.mark.filterwarnings("error")  # and no warning stands before the sentence
 @pytest.mark.parametrize("spoil, sentence", BAD, ids=[sentence for _, sentence in BAD])
-def test_bad_files_are_refused_in_one_sentence(tmp_path, spoil, sentence):
+def test_bad_files_are_refused_in_one_sentence(tmp_path, capsys, spoil, sentence):
     arrays = d4rl_arrays(40)
     spoil(arrays)
     path = write_hdf5(tmp_path / "data.hdf5", arrays)
     with pytest.raises(SystemExit, match=sentence) as stop:
         load_dataset(path)
     assert str(path) in stop.value.code and "\n" not in stop.value.code
+    assert capsys.readouterr() == ("", "")
 
 
-def test_a_batch_larger_than_the_dataset_is_refused(tmp_path):
-    path = write_hdf5(tmp_path / "data.hdf5", d4rl_arrays(40))
-    with pytest.raises(SystemExit, match="too few for --batch-size 256"):
-        load_dataset(path, batch_size=256)
+def test_actions_at_the_bounds_are_fine(tmp_path, capsys):
+    """Whatever the bounds are, and with a policy's rounding."""
+    arrays = d4rl_arrays(40)
+    arrays["actions"] = np.sign(arrays["actions"]) * 2.001
+    load_dataset(write_hdf5(tmp_path / "data.hdf5", arrays), max_action=2.0)
+    assert "38 transitions, with actions up to 2.001" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match=r"actions up to 2\.001"):
+        load_dataset(tmp_path / "data.hdf5", max_action=1.0)
 
 
-NO_HDF5 = {"empty": b"", "text": b"none", "short": DATASET.read_bytes()[:100_000]}
+# Files that can't be read
 
 
-@pytest.mark.parametrize("content", NO_HDF5.values(), ids=NO_HDF5)
-def test_files_that_are_no_hdf5_or_cut_short(tmp_path, content):
-    path = tmp_path / "data.hdf5"
-    path.write_bytes(content)
-    with pytest.raises(SystemExit, match="delete it to download it again"):
+def reason(path):
+    """Why a file can't be read: one sentence, which names the file, gives the library's
+    own reason, and advises nothing."""
+    with pytest.raises(SystemExit) as stop:
         load_dataset(path)
+    sentence = stop.value.code
+    assert sentence.startswith(f"{path} can't be read: ") and "\n" not in sentence
+    assert "delete" not in sentence and "damaged" not in sentence
+    return sentence
+
+
+def test_files_that_are_no_hdf5_or_not_there(tmp_path):
+    path = tmp_path / "data.hdf5"
+    assert "No such file" in reason(path)
+    for content in (b"", b"none"):
+        path.write_bytes(content)
+        assert "file signature not found" in reason(path)
+    path.write_bytes(DATASET.read_bytes()[:100_000])
+    assert "truncated file" in reason(path)
+
+
+def test_a_file_that_another_process_writes(tmp_path):
+    path = write_hdf5(tmp_path / "data.hdf5", d4rl_arrays(40))
+    with path.open("rb+") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert "unable to lock file" in reason(path)
+    load_dataset(path)
+
+
+def test_a_column_that_cannot_be_decompressed(tmp_path):
+    """A filter whose plugin is not installed, and bytes that are no gzip."""
+    path = write_hdf5(tmp_path / "data.hdf5", d4rl_arrays(40))
+    gzip = h5py.h5z.FILTER_DEFLATE
+    for number, words in ((32_001, "plugin"), (gzip, "filter returned failure")):
+        with h5py.File(path, "a") as file:
+            del file["rewards"]
+            properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+            properties.set_chunk((40,))
+            properties.set_filter(number, h5py.h5z.FLAG_OPTIONAL, (4,))
+            space = h5py.h5s.create_simple((40,))
+            column = h5py.h5d.create(
+                file.id, b"rewards", h5py.h5t.IEEE_F32LE, space, properties
+            )
+            column.write_direct_chunk((0,), b"no such format")
+        assert words in reason(path)
 
 
 def damage(content, rng):
@@ -253,7 +389,7 @@ def damage(content, rng):
 
 
 def test_damaged_files(tmp_path):
-    """They are told, or load as something that fits."""
+    """They are told, by the script or the library, or load as something that fits."""
     rng, told = np.random.default_rng(0), 0
     arrays = d4rl_arrays(40)
     plain, packed = write_hdf5(tmp_path / "plain.hdf5", arrays), tmp_path / "packed"
@@ -264,12 +400,15 @@ def test_damaged_files(tmp_path):
     for i in range(400):
         path.write_bytes(damage((plain, packed)[i % 2].read_bytes(), rng))
         try:
-            dataset, _ = load_dataset(path)
-            assert dataset["observations"].shape[1] == 17
-            assert all(torch.isfinite(column).all() for column in dataset.values())
+            dataset, *_ = load_dataset(path)
         except SystemExit as stop:
             told += 1
             assert str(path) in stop.code and "\n" not in stop.code
+        except (KeyError, RuntimeError) as error:  # by these names h5py tells some
+            assert "synchronously" in str(error)
+        else:
+            assert dataset["observations"].shape[1] == 17
+            assert all(torch.isfinite(column).all() for column in dataset.values())
     assert told > 100
 
 
@@ -278,20 +417,18 @@ import time, wpc
 def peak():
     return 1024 * int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0])
 before, start = peak(), time.perf_counter()
-dataset, _ = wpc.load_dataset({path!r}, {state_dim}, {action_dim}, wpc.Args())
-wpc.normalize_states(dataset)
+dataset, *_ = wpc.load_dataset({path!r}, {state_dim}, {action_dim}, 1.0, wpc.Args())
 size = sum(column.nbytes for column in dataset.values())
 print(time.perf_counter() - start, (peak() - before) / size, len(dataset["rewards"]))
 """
-FULL_SIZES = [  # one of each kind of D4RL's files
-    (1_000_000, 11, 3, np.float32),
+FULL_SIZES = [  # a replay file of D4RL's, and a medium one
     (402_000, 11, 3, np.float64),
-    (2_000_000, 17, 6, np.float32),
+    (1_000_000, 17, 6, np.float32),
 ]
 
 
 @pytest.mark.parametrize("rows, state_dim, action_dim, dtype", FULL_SIZES)
-def test_full_size_files_load_in_seconds_within_three_times_their_size(
+def test_full_size_files_load_in_seconds_within_five_times_their_size(
     tmp_path, rows, state_dim, action_dim, dtype
 ):
     arrays = {
@@ -308,6 +445,6 @@ def test_full_size_files_load_in_seconds_within_three_times_their_size(
     program = MEASURE.format(path=path, state_dim=state_dim, action_dim=action_dim)
     line = [sys.executable, "-c", program]
     process = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=True)
-    seconds, memory, transitions = map(float, process.stdout.split())
+    seconds, memory, transitions = map(float, process.stdout.splitlines()[-1].split())
     assert transitions == rows - rows // 1000
-    assert seconds < 60 and 1 < memory < 3
+    assert seconds < 60 and 1 < memory < 5

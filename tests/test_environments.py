@@ -1,260 +1,230 @@
 # SPDX-License-Identifier: MIT
-"""Any Gymnasium environment beside D4RL's robots, and Minari's datasets.
-
-tests/data/minari holds datasets that Minari's own DataCollector made (see
-tests/tools/make_minari_data.py): some episodes of Hopper-v5 end and some are cut off,
-all of Pendulum-v1's are cut off, and CartPole-v1's actions are discrete.
-"""
-
-import json
-import sys
+"""Environments of all kinds: D4RL's robots, Gymnasium's, and those of users."""
 
 import gymnasium as gym
-import h5py
-import minari
 import numpy as np
 import pytest
-import torch
 from conftest import (
     DATASET,
-    ROOT,
-    assert_one_sentence,
     command,
     d4rl_arrays,
     load,
     read_curves,
     read_rows,
     refusal,
-    run,
     run_here,
     wpc,
     write_hdf5,
 )
+from gymnasium.spaces import Box, Dict, Discrete
 
-MINARI = ROOT / "tests/data/minari/test"
-SHORT = ["--max-timesteps", 4, "--eval-freq", 2, "--eval-episodes", 2, "--log-freq", 1]
+SHORT = ["--max-timesteps", 4, "--eval-freq", 2, "--eval-episodes", 2]
 SHORT += ["--batch-size", 32, "--device", "cpu"]
 
 
-def convert(dataset, out):
-    """The process of from_minari.py."""
-    program = ROOT / "tests/tools/from_minari.py"
-    return run(sys.executable, program, dataset, "--out", out)
+@pytest.fixture
+def random_data(tmp_path):
+    """A file of Pendulum-v1's shapes."""
+    arrays = d4rl_arrays(100, 3, 1)
+    arrays["actions"] *= 2
+    return write_hdf5(tmp_path / "random data.hdf5", arrays)
 
 
-@pytest.fixture(scope="module")
-def pendulum(tmp_path_factory):
-    """Pendulum-v1's Minari dataset as an HDF5 file."""
-    path = tmp_path_factory.mktemp("minari") / "pendulum.hdf5"
-    process = convert(MINARI / "pendulum-v0", path)
-    assert process.returncode == 0, process.stderr
-    return path
+# Names
 
 
-class Spaces(gym.Env):
-    """An environment of these spaces."""
+def test_names_that_gymnasium_does_not_know():
+    for env, sentence in (
+        ("Nonsense-v0", "Environment `Nonsense` doesn't exist"),
+        ("Hopper-v99", "Environment version `v99` for environment `Hopper` doesn't"),
+    ):
+        line = [*command("wpc")[:2], "--env", env, "--dataset", DATASET]
+        assert sentence in refusal(wpc, *line)
 
-    def __init__(self, states, actions):
-        self.observation_space, self.action_space = states, actions
+
+def test_robots_and_tasks_move_in_d4rls_physics_and_other_names_do_not(script):
+    def body_masses(env):
+        (env,) = script.make_envs(env, 1).envs
+        assert env.spec.max_episode_steps == 1000
+        return env.unwrapped.model.body_mass.tolist()
+
+    for robot, (env_id, *_) in script.D4RL_ROBOTS.items():
+        old = body_masses(robot)
+        stock = gym.make(env_id).unwrapped.model.body_mass.tolist()
+        assert old == body_masses(f"{robot}-medium-replay-v2")
+        assert old != stock and stock == body_masses(env_id)
+    for env in ("Hopper-v5", "Ant-v5", "module:Hopper-v4", "module:hopper-v4"):
+        assert script.d4rl_robot(env) is None
 
 
-LINE = gym.spaces.Box(-1, 1, (3,))
-SPACES = {
-    "Discrete": (LINE, gym.spaces.Discrete(2), "must be a Box of one axis"),
-    "Dict": (gym.spaces.Dict(x=LINE), LINE, "must be a Box of one axis"),
-    "Image": (gym.spaces.Box(0, 255, (8, 8, 3)), LINE, "must be a Box of one axis"),
-    "Skew": (LINE, gym.spaces.Box(0, 1, (2,)), "all must go from -x to x"),
+# Spaces
+
+
+class Line(gym.Env):
+    """Episodes of 20 steps; the reward is the better, the smaller the action."""
+
+    observation_space = Box(-np.inf, np.inf, (3,), np.float32)
+    action_space = Box(-2, 2, (1,), np.float32)
+
+    def __init__(self, states=None, actions=None):
+        self.observation_space = states or self.observation_space
+        self.action_space = actions or self.action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.observation(), {}
+
+    def observation(self):
+        return self.np_random.standard_normal(3).astype(np.float32)
+
+    def step(self, action):
+        self.t += 1
+        return self.observation(), -abs(float(action[0])), self.t == 20, False, {}
+
+
+STATES = Box(-1, 1, (3,))
+SPACES = {  # states, actions, and which of them does not fit, as the sentence shows it
+    "Discrete": (STATES, Discrete(2), r"Discrete\(2\)"),
+    "Goals": (Dict(x=STATES), STATES, r"Dict\('x'"),
+    "Image": (Box(0, 255, (8, 8, 3)), STATES, r"Box\(0.0, 255.0, \(8, 8, 3\)"),
+    "Grid": (STATES, Box(-1, 1, (2, 2)), r"Box\(-1.0, 1.0, \(2, 2\)"),
+    "Skew": (STATES, Box(0, 1, (2,)), r"Box\(0.0, 1.0, \(2,\)"),
     "Uneven": (
-        LINE,
-        gym.spaces.Box(np.float32([-1, -2]), np.float32([1, 2])),
-        "same x",
+        STATES,
+        Box(np.float32([-1, -2]), np.float32([1, 2])),
+        r"Box\(\[-1. -2.\], \[1. 2.\]",
     ),
-    "Unbounded": (LINE, gym.spaces.Box(-np.inf, np.inf, (2,)), "all must go from -x"),
+    "Unbounded": (STATES, Box(-np.inf, np.inf, (2,)), r"Box\(-inf, inf"),
+    "HalfBounded": (STATES, Box(-np.inf, 1, (2,)), r"Box\(-inf, 1.0"),
 }
 for name, (states, actions, _) in SPACES.items():
     arguments = {"states": states, "actions": actions}
-    gym.register(f"{name}-v0", Spaces, max_episode_steps=5, kwargs=arguments)
+    gym.register(f"{name}-v0", Line, max_episode_steps=30, kwargs=arguments)
+gym.register("Endless-v0", Line)
+gym.register("Line-v0", Line, max_episode_steps=30)
 
 
 @pytest.mark.parametrize("name", SPACES)
 def test_spaces_that_do_not_fit_are_refused(name):
-    line = [*command("wpc")[:2], "--env", f"{name}-v0", "--dataset", DATASET]
-    sentence = refusal(wpc, *line)
-    assert sentence.startswith(f"--env {name}-v0 has ") and SPACES[name][2] in sentence
+    with pytest.raises(SystemExit, match=SPACES[name][2]) as stop:
+        wpc.make_envs(f"{name}-v0", 2)
+    sentence = stop.value.code
+    assert sentence.startswith(f"--env {name}-v0 ") and "\n" not in sentence
+    assert "states in a Box of one axis" in sentence
 
 
-NAMES = [
-    ("Nonsense-v0", "--env Nonsense-v0 can't be made: Environment `Nonsense` doesn't"),
-    ("Hopper-v99", "--env Hopper-v99 can't be made: "),
-    ("hopper-medium-v0", "--env hopper-medium-v0 can't be made: "),
-    ("no_such_module:Pendulum-v1", "can't be made: No module named 'no_such_module'"),
-]
+def test_an_environment_without_a_time_limit_is_refused():
+    """Its episodes may never end, and then an evaluation wouldn't, either."""
+    with pytest.raises(SystemExit, match=r"--env Endless-v0 .* a time limit.* None"):
+        wpc.make_envs("Endless-v0", 2)
 
 
-@pytest.mark.parametrize("env, sentence", NAMES)
-def test_names_that_gymnasium_does_not_know(env, sentence):
-    line = [*command("wpc")[:2], "--env", env, "--dataset", DATASET]
-    assert sentence in refusal(wpc, *line)
+# Environments that break
 
 
-def test_names_of_robots_and_tasks():
-    for robot, env_id in wpc.D4RL_ROBOTS.items():
-        for env in (robot, f"{robot}-medium-replay-v2", env_id):
-            assert wpc.gymnasium_id(env) == env_id
-    for env in ("Hopper-v5", "Ant-v5", "hopper-medium-v0", "module:Hopper-v4"):
-        assert wpc.gymnasium_id(env) == env
+class RewardArray(Line):
+    def step(self, action):
+        state, reward, *ends = super().step(action)
+        return state, np.array([reward, reward]), *ends
 
 
-def test_a_run_on_another_environment(pendulum, tmp_path):
-    """The file names it; its actions go from -2 to 2, and it has no score of D4RL's."""
-    line = [*command("wpc")[:2], "--dataset", pendulum, *SHORT]
-    run_here(wpc, *line, "--run-dir", tmp_path)
-    assert json.loads((tmp_path / "args.json").read_text())["env"] == "Pendulum-v1"
-    rows = read_rows(tmp_path)
-    columns = ["step", "mean_return", "std_over_episodes", "returns"]
-    assert list(rows[-1])[:4] == columns and "normalized_score" not in rows[-1]
-    returns = np.array([float(x) for x in rows[-1]["returns"].split()])
-    assert float(rows[-1]["mean_return"]) == pytest.approx(returns.mean(), abs=0.01)
-    assert float(rows[-1]["std_over_episodes"]) == pytest.approx(
-        returns.std(), abs=0.01
-    )
-    assert [step for step, _ in read_curves(tmp_path)["eval/mean_return"]] == [2, 4]
-
-    checkpoint = load(tmp_path)
-    agent = wpc.Agent(3, 1, 2.0, wpc.Args())
-    agent.load_state_dict(checkpoint["networks"])
-    envs = wpc.make_envs("Pendulum-v1", 2)
-    mean, std = checkpoint["mean"], checkpoint["std"]
-    assert wpc.evaluate(envs, agent.actor, mean, std, 0) == pytest.approx(
-        returns, abs=0.01
-    )
+class OldReset(Line):
+    def reset(self):  # without seed and options, as in Gym before 0.26
+        return super().reset()
 
 
-def test_an_environment_of_the_users_own(pendulum, monkeypatch, tmp_path, capsys):
+class NeedsOptions(Line):
+    def reset(self, *, seed=None, options=None):
+        self.goal = options["goal"]
+        return super().reset(seed=seed)
+
+
+class OnlyOne(Line):
+    made = False
+
+    def __init__(self):
+        if OnlyOne.made:
+            raise RuntimeError("the simulator is already in use")
+        OnlyOne.made = True
+
+
+class Crashes(Line):
+    def step(self, action):
+        if self.t == 5:
+            raise ValueError("simulator unstable")
+        return super().step(action)
+
+
+BROKEN = {
+    RewardArray: (ValueError, "setting an array element with a sequence"),
+    OldReset: (TypeError, "unexpected keyword argument 'seed'"),
+    NeedsOptions: (TypeError, "'NoneType' object is not subscriptable"),
+    OnlyOne: (RuntimeError, "the simulator is already in use"),
+    Crashes: (ValueError, "simulator unstable"),
+}
+for entry_point in BROKEN:
+    gym.register(f"{entry_point.__name__}-v0", entry_point, max_episode_steps=30)
+
+
+@pytest.mark.parametrize("broken", BROKEN)
+def test_environments_that_break_do_so_before_the_first_step(
+    monkeypatch, random_data, tmp_path, broken
+):
+    """With their own error and traceback."""
+    monkeypatch.setattr(wpc.Agent, "update", None)
+    error, sentence = BROKEN[broken]
+    line = [*command("wpc")[:2], "--env", f"{broken.__name__}-v0", *SHORT]
+    line += ["--dataset", random_data, "--run-dir", tmp_path / "run"]
+    with pytest.raises(error, match=sentence):
+        run_here(wpc, *line)
+    assert not (tmp_path / "run/checkpoint.pt").exists()
+
+
+class NotANumber(Line):
+    def observation(self):
+        return np.full(3, np.nan, np.float32)
+
+
+gym.register("NotANumber-v0", NotANumber, max_episode_steps=30)
+
+
+def test_states_that_are_not_finite_stop_the_run(random_data, tmp_path):
+    line = [*command("wpc")[:2], "--env", "NotANumber-v0", *SHORT]
+    line += ["--dataset", random_data, "--run-dir", tmp_path / "run"]
+    assert "step 0: " in refusal(wpc, *line)
+    assert not (tmp_path / "run/checkpoint.pt").exists()
+
+
+# Runs
+
+
+def test_a_run_on_another_environment(random_data, tmp_path):
+    """Its actions go from -2 to 2, and it has no score of D4RL's."""
+    line = [*command("wpc")[:2], "--env", "Line-v0", "--dataset", random_data, *SHORT]
+    run_here(wpc, *line, "--run-dir", tmp_path / "run")
+    rows = read_rows(tmp_path / "run")
+    assert [row["step"] for row in rows] == ["0", "2", "4"]
+    columns = ["step", "mean_return", "std_return", "best_return", "q"]
+    assert list(rows[0])[:5] == columns and "normalized_score" not in rows[0]
+    curve = read_curves(tmp_path / "run")["mean_return"]
+    assert [step for step, _ in curve] == [0, 2, 4]
+
+    checkpoint = load(tmp_path / "run")
+    actor = wpc.Actor(3, 1, checkpoint["max_action"])
+    assert checkpoint["max_action"] == 2
+    actor.load_state_dict(checkpoint["agent"]["actor"])
+    envs, args = wpc.make_envs("Line-v0", 2), wpc.Args(env="Line-v0", dataset="none")
+    again = wpc.evaluate(envs, actor, checkpoint["mean"], checkpoint["std"], args)
+    assert again["mean_return"] == pytest.approx(float(rows[-1]["mean_return"]))
+    assert again["std_return"] == pytest.approx(float(rows[-1]["std_return"]))
+
+
+def test_an_environment_of_the_users_own(monkeypatch, random_data, tmp_path, capsys):
     program = "import gymnasium\ngymnasium.register('Mine-v3', 'gymnasium.envs."
     program += "classic_control.pendulum:PendulumEnv', max_episode_steps=7)\n"
     (tmp_path / "my_envs.py").write_text(program)
     monkeypatch.syspath_prepend(tmp_path)
-    line = [*command("wpc")[:2], "--env", "my_envs:Mine-v3", "--dataset", pendulum]
+    line = [*command("wpc")[:2], "--env", "my_envs:Mine-v3", "--dataset", random_data]
     run_here(wpc, *line, *SHORT, "--run-dir", tmp_path / "run")
-    output = capsys.readouterr().out
-    assert "step 4: mean return -" in output
-    warning = f"warning: {pendulum} is from Pendulum-v1, --env is my_envs:Mine-v3"
-    assert output.startswith(warning)
-    run_here(wpc, *command("wpc")[:2], "--run-dir", tmp_path / "run")  # continues
-    assert "finished at step 4" in capsys.readouterr().out
-
-
-def test_versions_that_disagree(tmp_path, capsys):
-    path = write_hdf5(tmp_path / "hopper.hdf5", d4rl_arrays(100, 11, 3))
-    for env_id, warns in (("Hopper-v5", True), ("Hopper-v4", False)):
-        with h5py.File(path, "a") as file:
-            file.attrs["env_id"] = env_id
-        line = [*command("wpc")[:2], "--env", "hopper", "--dataset", path, *SHORT]
-        run_here(wpc, *line, "--run-dir", tmp_path / env_id)
-        output = capsys.readouterr().out
-        assert output.startswith("warning: ") == warns
-        assert "normalized score" in output
-
-
-def test_neither_the_file_nor_the_user_names_an_environment():
-    line = [*command("wpc")[:2], "--dataset", DATASET]
-    assert refusal(wpc, *line).endswith("names no environment: add --env")
-    assert "--env is None: name a D4RL task (half" in refusal(wpc, *command("wpc")[:2])
-
-
-# Minari
-
-
-def minari_transitions(name):
-    """Every transition as Minari has it, and the rewards of each episode."""
-    dataset = minari.MinariDataset(MINARI / name / "data")
-    rows, episodes = [], []
-    for episode in dataset.iterate_episodes():
-        episodes.append(episode.rewards)
-        for t in range(len(episode.actions)):
-            row = (
-                episode.observations[t],
-                episode.actions[t],
-                episode.rewards[t],
-                episode.observations[t + 1],
-                episode.terminations[t],
-            )
-            rows.append([np.float32(x) for x in row])
-    return rows, episodes
-
-
-SHAPES = [("hopper-v0", 11, 3), ("pendulum-v0", 3, 1)]
-
-
-@pytest.mark.parametrize("name, state_dim, action_dim", SHAPES)
-def test_no_transition_of_minaris_is_lost(tmp_path, name, state_dim, action_dim):
-    path = tmp_path / "data.hdf5"
-    assert convert(MINARI / name, path).returncode == 0
-    args = wpc.Args(batch_size=1, weight="static")
-    dataset, discounted_returns = wpc.load_dataset(path, state_dim, action_dim, args)
-    rows, episodes = minari_transitions(name)
-    keys = ("observations", "actions", "rewards", "next_observations", "terminals")
-    for i, key in enumerate(keys):
-        expected = np.array([row[i] for row in rows]).reshape(len(rows), -1)
-        assert np.array_equal(dataset[key].numpy(), expected), key
-    powers = [0.99 ** np.arange(len(rewards)) for rewards in episodes]
-    expected = [p @ np.float32(r) for p, r in zip(powers, episodes, strict=True)]
-    assert discounted_returns == pytest.approx(expected, rel=1e-6)
-    totals = np.array([np.float32(rewards).sum() for rewards in episodes])
-    half = np.repeat(totals >= np.median(totals), [len(r) for r in episodes])
-    assert dataset["better_half"][:, 0].tolist() == half.tolist()
-
-
-def test_the_stored_episodes_end_in_both_ways():
-    dataset = minari.MinariDataset(MINARI / "hopper-v0/data")
-    ends = {bool(e.terminations[-1]) for e in dataset.iterate_episodes()}
-    assert ends == {True, False}
-
-
-def test_the_file_says_where_it_is_from(pendulum, tmp_path):
-    path = tmp_path / "hopper.hdf5"
-    process = convert(MINARI / "hopper-v0/data", path)  # the inner folder will do
-    assert " episodes of Hopper-v5" in process.stdout
-    with h5py.File(path) as file:
-        attributes = dict(file.attrs)
-    assert attributes == {
-        "env_id": "Hopper-v5",
-        "source": "Minari's test/hopper-v0",
-        "ref_min_score": 1.0,
-        "ref_max_score": 100.0,
-    }
-    with h5py.File(pendulum) as file:
-        assert file.attrs.keys() == {"env_id", "source"}
-
-
-REFUSED = [
-    (MINARI / "cartpole-v0", "action_space Discrete(2): it must be a Box of one axis"),
-    (ROOT / "tests", "can't be opened or downloaded by Minari"),
-    ("nonsense", "can't be opened or downloaded by Minari"),
-]
-
-
-@pytest.mark.parametrize("dataset, sentence", REFUSED)
-def test_what_from_minari_refuses(tmp_path, dataset, sentence):
-    process = convert(dataset, tmp_path / "data.hdf5")
-    assert_one_sentence(process, sentence)
-    assert not (tmp_path / "data.hdf5").exists()
-
-
-# make_dataset.py
-
-
-def test_make_dataset_names_the_environment(tmp_path, capsys):
-    program, path = ROOT / "tests/tools/make_dataset.py", tmp_path / "made.hdf5"
-    line = [sys.executable, program, "--out", path, "--steps", 250]
-    line += ["--random-steps", 240]
-    process = run(*line, "--env", "Pendulum-v1")
-    assert process.returncode == 0, process.stderr
-    assert wpc.read_env_id(path) == "Pendulum-v1"
-    dataset, returns = wpc.load_dataset(path, 3, 1, wpc.Args(batch_size=1))
-    assert len(dataset["rewards"]) == 248 and len(returns) == 2  # without two timeouts
-    assert 1 < dataset["actions"].abs().max() <= 2
-    assert torch.isfinite(dataset["observations"]).all()
-    process = run(*line, "--env", "CartPole-v1")
-    assert_one_sentence(process, "both must be a Box of one axis")
+    assert "step 4: mean_return -" in capsys.readouterr().out

@@ -46,19 +46,27 @@ def constant_actor(action):
     return actor
 
 
+def options(env="Countdown-v0", seed=0):
+    return wpc.Args(env=env, dataset="none", seed=seed)
+
+
 def first_lengths(envs, seed):
     envs.reset(seed=1000 * (seed + 100))
     return [env.unwrapped.length for env in envs.envs]
 
 
-def test_only_each_first_episode_counts():
+def test_only_each_first_episode_counts(script):
     envs = gym.vector.SyncVectorEnv([Countdown] * 16)
-    returns = wpc.evaluate(envs, constant_actor(0.5), MEAN, STD, seed=0)
-    lengths = first_lengths(envs, 0)
-    assert min(lengths) < max(
-        lengths
-    )  # some go on to a second episode while others are in their first
-    assert returns == pytest.approx(1.5 * np.array(lengths))
+    row = script.evaluate(envs, constant_actor(0.5), MEAN, STD, options())
+    lengths = np.array(first_lengths(envs, 0))
+    # some go on to a second episode while others are in their first, and first episodes
+    # end in both ways
+    assert lengths.min() < lengths.max()
+    assert {env.unwrapped.truncates for env in envs.envs} == {True, False}
+    assert row == {
+        "mean_return": pytest.approx(1.5 * lengths.mean()),
+        "std_return": pytest.approx(1.5 * lengths.std()),
+    }
 
 
 def test_the_actor_sees_normalized_observations():
@@ -69,13 +77,12 @@ def test_the_actor_sees_normalized_observations():
         return torch.zeros(len(s), 1)
 
     envs = gym.vector.SyncVectorEnv([Countdown] * 2)
-    wpc.evaluate(
-        envs, actor, torch.tensor([1.0, 2, 3]), torch.tensor([2.0, 4, 8]), seed=0
-    )
-    assert seen[0][:, 0].tolist() == [
-        (length - 1) / 2 for length in first_lengths(envs, 0)
-    ]
+    mean, std = torch.tensor([1.0, 2, 3]), torch.tensor([2.0, 4, 8])
+    wpc.evaluate(envs, actor, mean, std, options())
+    lengths = first_lengths(envs, 0)
+    assert seen[0][:, 0].tolist() == [(length - 1) / 2 for length in lengths]
     assert seen[0][:, 1:].tolist() == [[-2 / 4, -3 / 8]] * 2
+    assert seen[1][:, 0].tolist() == [(length - 2) / 2 for length in lengths]
 
 
 @pytest.mark.parametrize("robot", wpc.D4RL_ROBOTS)
@@ -83,31 +90,34 @@ def test_a_seed_fixes_the_episodes_and_no_two_share_one(robot):
     envs = wpc.make_envs(robot, 3)
     state_dim = envs.single_observation_space.shape[0]
     action_dim = envs.single_action_space.shape[0]
+    torch.manual_seed(0)
     actor = wpc.Actor(state_dim, action_dim, max_action=1.0)
     mean, std = torch.zeros(state_dim), torch.ones(state_dim)
     first, again, other = (
-        wpc.evaluate(envs, actor, mean, std, seed) for seed in (0, 0, 1)
+        wpc.evaluate(envs, actor, mean, std, options(seed=seed)) for seed in (0, 0, 1)
     )
-    assert first.tolist() == again.tolist()
-    assert len({*first, *other}) == 6
+    assert first == again and first["mean_return"] != other["mean_return"]
+    assert first["std_return"] > 0  # nor do two environments of an evaluation
+    # The environments of seed s are seeded with 1000 (s + 100) to 1000 (s + 100) + 2
+    states = {
+        seed: envs.reset(seed=1000 * (seed + 100))[0].tolist() for seed in range(3)
+    }
+    assert len({tuple(state) for s in states.values() for state in s}) == 9
 
 
-def test_the_largest_evaluations_of_two_seeds_share_no_episode():
-    assert wpc.LIMITS["eval_episodes"][1] <= 1000  # environment i has 1000 (...) + i
-
-
-def test_normalized_scores_are_d4rls():
-    """By the published constants, for every dataset of a robot."""
+def test_normalized_scores_are_d4rls(script):
+    """By the published constants, for every dataset of a robot, and no other name."""
     returns = {
         "hopper": (-20.272305, 3234.3),
         "halfcheetah": (-280.178953, 12135.0),
         "walker2d": (1.629008, 4592.3),
     }
-    for robot, (random_return, expert_return) in returns.items():
+    envs = gym.vector.SyncVectorEnv([Countdown] * 4)
+    for robot, (low, high) in returns.items():
         for env in (robot, f"{robot}-medium-replay-v2"):
-            score = wpc.normalized_score(np.array([random_return, expert_return]), env)
-            assert score == pytest.approx([0, 100])
-    halfway = wpc.normalized_score(np.array([6067.5]), "halfcheetah-medium-v2")
-    assert halfway == pytest.approx(100 * 6347.678953 / 12415.178953)
-    env_ids = ["HalfCheetah-v4", "Hopper-v4", "Walker2d-v4"]
-    assert [*wpc.D4RL_ROBOTS.values()] == [*wpc.D4RL_RETURNS] == env_ids
+            row = script.evaluate(envs, constant_actor(0.5), MEAN, STD, options(env))
+            score = 100 * (row["mean_return"] - low) / (high - low)
+            assert row["normalized_score"] == pytest.approx(score, rel=1e-9)
+    for env in ("Hopper-v4", "hopper_medium", "ant", "my:hopper-v2"):
+        row = script.evaluate(envs, constant_actor(0.5), MEAN, STD, options(env))
+        assert "normalized_score" not in row

@@ -32,7 +32,9 @@ def make_dataset():
 def mean_reward(script, alpha, **options):
     """The policy's mean reward after 600 steps of training."""
     dataset = make_dataset()
-    args = script.Args(alpha=alpha, actor_lr=3e-3, critic_lr=3e-3, **options)
+    args = script.Args(
+        device="cpu", alpha=alpha, actor_lr=3e-3, critic_lr=3e-3, **options
+    )
     agent = script.Agent(1, 1, 1.0, args)
     for step in range(1, 601):
         agent.update(script.sample_batch(dataset, 64), step)

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
 """The scripts share no code: what they have in common is the same text in each, so that
-`diff` shows the algorithm and nothing else.
+`diff` shows the algorithm and nothing else. And they stay small.
 
 tests/diffs/ holds the differences as they should be. To change them on purpose, run
 
     python tests/test_twins.py
 """
 
+import ast
 import difflib
 import subprocess
 import sys
@@ -50,6 +51,38 @@ def test_scripts_stand_alone(name):
     text = (ROOT / f"{name}.py").read_text()
     for other in NAMES:
         assert f"import {other}" not in text and f"from {other}" not in text
+
+
+# Size: what the user ordered is minimal. A line more has to take the place of another.
+
+LINES, NODES, FUNCTION, DIFF = 560, 4_100, 80, 64
+
+
+def size(name):
+    """A script's lines and the nodes of its syntax tree."""
+    text = (ROOT / f"{name}.py").read_text()
+    return len(text.splitlines()), len(list(ast.walk(ast.parse(text))))
+
+
+def test_scripts_stay_small():
+    lines, nodes = size("wpc")
+    assert lines <= LINES and nodes <= NODES
+    for name in ("td3_bc", "wbc"):
+        assert size(name)[0] < lines and size(name)[1] < nodes
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_function_fits_on_a_screen_and_the_algorithm_in_the_first_half(name):
+    tree = ast.parse((ROOT / f"{name}.py").read_text())
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    assert max(f.end_lineno - f.lineno + 1 for f in functions) <= FUNCTION
+    (update,) = [f for f in functions if f.name == "update"]
+    assert update.end_lineno < size(name)[0] / 2
+
+
+def test_the_diff_is_short():
+    changed = [line for line in real_diff("td3_bc", "wpc") if line[0] in "<>"]
+    assert len(changed) <= DIFF
 
 
 @pytest.mark.parametrize("action", [["check"], ["format", "--check"]])

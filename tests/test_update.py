@@ -5,7 +5,7 @@ identities between the three scripts."""
 import numpy as np
 import pytest
 import torch
-from conftest import SCRIPTS, td3_bc, wbc, wpc
+from conftest import SCRIPTS, networks, td3_bc, wbc, wpc
 
 STATE_DIM, ACTION_DIM, MAX_ACTION, BATCH = 5, 3, 1.5, 64
 
@@ -30,8 +30,10 @@ def make_agent(script, **options):
     where mean |Q| is not mean Q, and its target policy is at the edge, where noise
     leads over it."""
     torch.manual_seed(3)
-    args = script.Args(**options)
-    agent = script.Agent(STATE_DIM, ACTION_DIM, MAX_ACTION, args).double()
+    args = script.Args(device="cpu", **options)
+    agent = script.Agent(STATE_DIM, ACTION_DIM, MAX_ACTION, args)
+    for network in networks(agent).values():
+        network.double()
     with torch.no_grad():
         for target in (agent.actor_target, agent.critic_target):
             for parameter in target.parameters():
@@ -66,8 +68,7 @@ def center_value(agent, batch):
 
 
 def numpy_networks(agent):
-    networks = dict(agent.named_children())
-    return {name: numpy_parameters(network) for name, network in networks.items()}
+    return {name: numpy_parameters(net) for name, net in networks(agent).items()}
 
 
 def numpy_parameters(network):
@@ -89,28 +90,28 @@ def q_values(p, s, a):
     return mlp(p[:6], sa), mlp(p[6:], sa)
 
 
-def target(networks, batch, args, noise):
+def target(nets, batch, args, noise):
     """y of Algorithm 1, from standard normal noise."""
     noise = np.clip(args.policy_noise * noise, -args.noise_clip, args.noise_clip)
     s_next = batch["next_observations"]
-    a_next = policy(networks["actor_target"], s_next) + MAX_ACTION * noise
+    a_next = policy(nets["actor_target"], s_next) + MAX_ACTION * noise
     a_next = np.clip(a_next, -MAX_ACTION, MAX_ACTION)
-    q_next = np.minimum(*q_values(networks["critic_target"], s_next, a_next))
+    q_next = np.minimum(*q_values(nets["critic_target"], s_next, a_next))
     return batch["rewards"] + args.discount * (1 - batch["terminals"]) * q_next
 
 
-def critic_loss(networks, batch, y):
-    q1, q2 = q_values(networks["critic"], batch["observations"], batch["actions"])
+def critic_loss(nets, batch, y):
+    q1, q2 = q_values(nets["critic"], batch["observations"], batch["actions"])
     return ((q1 - y) ** 2).mean() + ((q2 - y) ** 2).mean()
 
 
-def value_loss(networks, batch, y):
-    return ((mlp(networks["value"], batch["observations"]) - y) ** 2).mean()
+def value_loss(nets, batch, y):
+    return ((mlp(nets["value"], batch["observations"]) - y) ** 2).mean()
 
 
-def advantage(networks, batch):
+def advantage(nets, batch):
     s, a = batch["observations"], batch["actions"]
-    return q_values(networks["critic"], s, a)[0] - mlp(networks["value"], s)
+    return q_values(nets["critic"], s, a)[0] - mlp(nets["value"], s)
 
 
 def weight(kind, advantage, batch, permutation):
@@ -125,17 +126,17 @@ def weight(kind, advantage, batch, permutation):
     return weights[kind]
 
 
-def lmbda(networks, batch, alpha):
+def lmbda(nets, batch, alpha):
     s = batch["observations"]
-    q = q_values(networks["critic"], s, policy(networks["actor"], s))[0]
+    q = q_values(nets["critic"], s, policy(nets["actor"], s))[0]
     return alpha / np.abs(q).mean()
 
 
-def actor_loss(networks, batch, weight, lmbda):
+def actor_loss(nets, batch, weight, lmbda):
     """The negative of equation 6; lambda is a constant to the gradient."""
     s, a = batch["observations"], batch["actions"]
-    pi = policy(networks["actor"], s)
-    q = q_values(networks["critic"], s, pi)[0]
+    pi = policy(nets["actor"], s)
+    q = q_values(nets["critic"], s, pi)[0]
     return -lmbda * q.mean() + (weight * (pi - a) ** 2).mean()
 
 
@@ -162,61 +163,82 @@ def assert_adam_step(before, after, network, learning_rate):
         gradient = tensor.grad.numpy()
         sure = np.abs(gradient) > 1e-5
         expected = -learning_rate * np.sign(gradient)[sure]
-        assert (new - old)[sure] == pytest.approx(expected, rel=1e-2)
+        np.testing.assert_allclose((new - old)[sure], expected, rtol=1e-2)
 
 
-@pytest.mark.parametrize("name, options", CASES)
-def test_a_step_agrees_with_numpy(name, options):
-    agent = make_agent(SCRIPTS[name], **OPTIONS, **options)
-    batch, has_value = make_batch(), name != "td3_bc"
-    if has_value:
-        center_value(agent, batch)
+def assert_critics_and_value_agree(agent, batch, step):
+    """Does a step and compares what it does to critics and value with NumPy.
+
+    Returns the networks before the step and after it, and its metrics.
+    """
     before, arrays = numpy_networks(agent), {k: x.numpy() for k, x in batch.items()}
-
-    torch.manual_seed(7)
+    torch.manual_seed(step)
     noise = torch.randn(BATCH, ACTION_DIM, dtype=torch.float64).numpy()
-    permutation = torch.randperm(BATCH).numpy()
-    torch.manual_seed(7)
-    metrics = {key: x.item() for key, x in agent.update(batch, step=2).items()}
+    torch.manual_seed(step)
+    metrics = {key: x.item() for key, x in agent.update(batch, step).items()}
     after = numpy_networks(agent)
 
-    # critics and value, from the networks before the step
     y = target(before, arrays, agent.args, noise)
     q1, _ = q_values(before["critic"], arrays["observations"], arrays["actions"])
     expected = {"q": q1.mean(), "critic_loss": critic_loss(before, arrays, y)}
-    loss = lambda: critic_loss(before, arrays, y)  # noqa: E731
-    assert_gradient(loss, before["critic"], agent.critic)  # nothing of the policy's
-    assert_adam_step(before["critic"], after["critic"], agent.critic, 1e-4)
-    if has_value:
+    if "value" in before:
         expected["v"] = mlp(before["value"], arrays["observations"]).mean()
         expected["value_loss"] = value_loss(before, arrays, y)
+    assert metrics | expected == pytest.approx(metrics, rel=1e-6)
+    if step % 2:  # else the policy's step has left its gradients in the critics
+        loss = lambda: critic_loss(before, arrays, y)  # noqa: E731
+        assert_gradient(loss, before["critic"], agent.critic)
+    if "value" in before:
         loss = lambda: value_loss(before, arrays, y)  # noqa: E731
         assert_gradient(loss, before["value"], agent.value)
+    return before, after, metrics
+
+
+@pytest.mark.parametrize("name, options", CASES)
+def test_three_steps_agree_with_numpy(name, options):
+    agent = make_agent(SCRIPTS[name], **OPTIONS, **options)
+    batch, has_value = make_batch(), name != "td3_bc"
+    arrays = {k: x.numpy() for k, x in batch.items()}
+    if has_value:
+        center_value(agent, batch)
+
+    before, after, _ = assert_critics_and_value_agree(agent, batch, step=1)
+    assert_adam_step(before["critic"], after["critic"], agent.critic, 1e-4)
+    if has_value:
         assert_adam_step(before["value"], after["value"], agent.value, 2e-4)
 
     # the policy, from critics and value after the step
-    networks = after | {"actor": before["actor"]}
-    w = np.ones((BATCH, 1))
+    before, after, metrics = assert_critics_and_value_agree(agent, batch, step=2)
+    nets = after | {"actor": before["actor"]}
+    expected, w = {}, np.ones((BATCH, 1))
     if has_value:
         old, new = advantage(before, arrays), advantage(after, arrays)
         assert 0.2 < (new > 0).mean() < 0.8  # these cases can tell one weight from
         assert ((old > 0) != (new > 0)).any()  # another, and old networks from new
+        torch.manual_seed(2)
+        torch.randn(BATCH, ACTION_DIM, dtype=torch.float64)  # the target's noise
+        permutation = torch.randperm(BATCH).numpy()
         w = weight(options.get("weight", "binary"), new, arrays, permutation)
         expected["weight"] = w.mean()
     lam = 0.0
     if "alpha" in options:
-        lam = expected["lmbda"] = lmbda(networks, arrays, options["alpha"])
-    expected["actor_loss"] = actor_loss(networks, arrays, w, lam)
-    loss = lambda: actor_loss(networks, arrays, w, lam)  # noqa: E731
-    assert_gradient(loss, networks["actor"], agent.actor)
+        lam = expected["lmbda"] = lmbda(nets, arrays, options["alpha"])
+    expected["actor_loss"] = actor_loss(nets, arrays, w, lam)
+    loss = lambda: actor_loss(nets, arrays, w, lam)  # noqa: E731
+    assert_gradient(loss, nets["actor"], agent.actor)
     assert_adam_step(before["actor"], after["actor"], agent.actor, 1e-3)
+    for key in ("q", "critic_loss", "v", "value_loss"):
+        metrics.pop(key, None)
     assert metrics == pytest.approx(expected, rel=1e-6)
 
     for network in ("actor", "critic"):
         pairs = zip(before[f"{network}_target"], after[network], strict=True)
         moved = [0.9 * old + 0.1 * new for old, new in pairs]
         for parameter, there in zip(after[f"{network}_target"], moved, strict=True):
-            assert parameter == pytest.approx(there, rel=1e-12)
+            np.testing.assert_allclose(parameter, there, 1e-12, 1e-12)
+
+    # the next step has forgotten the gradients of this one
+    assert_critics_and_value_agree(agent, batch, step=3)
 
 
 STEPS = [(2, 1, False), (2, 2, True), (3, 2, False), (3, 3, True), (1, 1, True)]
@@ -243,39 +265,44 @@ def test_networks_are_table_4s_and_start_alike():
     agents = {}
     for name, script in SCRIPTS.items():
         torch.manual_seed(5)
-        args = script.Args()
+        args = script.Args(device="cpu")
         agents[name] = script.Agent(STATE_DIM, ACTION_DIM, MAX_ACTION, args)
-    shapes = [tuple(p.shape) for p in agents["wpc"].value.parameters()]
+    ours = networks(agents["wpc"])
+    shapes = [tuple(p.shape) for p in ours["value"].parameters()]
     hidden = [(256, STATE_DIM), (256,), (256, 256), (256,)]
     assert shapes == [*hidden, (1, 256), (1,)]
-    ours = agents["wpc"].state_dict()
     for name in ("td3_bc", "wbc"):
-        for key, parameter in agents[name].state_dict().items():
-            assert torch.equal(parameter, ours[key]), key
+        for key, network in networks(agents[name]).items():
+            assert_same_network(network, ours[key])
     far = agents["wpc"].actor(1e6 * torch.ones(1, STATE_DIM))
     assert far.abs().max() == MAX_ACTION
+
+
+def assert_same_network(one, other):
+    for p, q in zip(one.parameters(), other.parameters(), strict=True):
+        assert torch.equal(p, q)
 
 
 def twenty_steps(script, better_half=None, **options):
     """An agent after 20 steps in float32, the last column filled with `better_half`."""
     torch.manual_seed(1)
-    agent = script.Agent(STATE_DIM, ACTION_DIM, MAX_ACTION, script.Args(**options))
-    torch.manual_seed(1)
+    args = script.Args(device="cpu", **options)
+    agent = script.Agent(STATE_DIM, ACTION_DIM, MAX_ACTION, args)
     dataset = {key: x.float() for key, x in make_batch().items()}
     if better_half is not None:
         dataset["better_half"] = torch.full((BATCH, 1), better_half)
     torch.manual_seed(1)
     for step in range(1, 21):
         agent.update(script.sample_batch(dataset, 32), step)
-    return agent.state_dict()
+    return networks(agent)
 
 
 def assert_same(one, other):
-    """Both state dicts agree to the last bit where they share a network."""
+    """Both agents agree to the last bit in the networks that they share."""
     shared = one.keys() & other.keys()
-    assert {key.split(".")[0] for key in shared} >= {"actor", "critic", "actor_target"}
-    for key in shared:
-        assert torch.equal(one[key], other[key]), key
+    assert shared >= {"actor", "actor_target", "critic", "critic_target"}
+    for name in shared:
+        assert_same_network(one[name], other[name])
 
 
 def test_wpc_with_weight_one_is_td3_bc():
@@ -289,7 +316,8 @@ def test_wpc_without_the_q_term_is_wbc():
 
 def test_td3_bc_without_the_q_term_is_behaviour_cloning():
     torch.manual_seed(1)
-    actor = td3_bc.Agent(STATE_DIM, ACTION_DIM, MAX_ACTION, td3_bc.Args()).actor
+    args = td3_bc.Args(device="cpu")
+    actor = td3_bc.Agent(STATE_DIM, ACTION_DIM, MAX_ACTION, args).actor
     optimizer = td3_bc.adam(actor, 3e-4)
     dataset = {key: x.float() for key, x in make_batch().items()}
     torch.manual_seed(1)
@@ -301,57 +329,36 @@ def test_td3_bc_without_the_q_term_is_behaviour_cloning():
             optimizer.zero_grad()
             ((pi - batch["actions"]) ** 2).mean().backward()
             optimizer.step()
-    theirs = twenty_steps(td3_bc, alpha=0.0)
-    for key, parameter in actor.state_dict().items():
-        assert torch.equal(parameter, theirs[f"actor.{key}"])
+    assert_same_network(actor, twenty_steps(td3_bc, alpha=0.0)["actor"])
 
 
-ADVANTAGES = [-1e4, -2.0, -1e-3, 0.0, 1e-3, 0.5, 3.0, 1e4]
+@pytest.mark.parametrize("script", [wpc, wbc])
+def test_an_action_that_is_as_good_as_average_has_weight_zero(script):
+    agent = make_agent(script, critic_lr=0.0, value_lr=0.0)
+    for network in (agent.critic, agent.value):
+        for parameter in network.parameters():
+            parameter.data.zero_()
+    assert agent.update(make_batch(), step=2)["weight"] == 0  # as Q = V = 0
 
 
-def weights_of(kind, seed=0, **options):
-    """wpc's weights of `ADVANTAGES`, read off the gradient of the policy's constraint:
-    with pi = 0, a = 1 and no Q term, it is proportional to the weight."""
-    n = len(ADVANTAGES)
-    args = wpc.Args(alpha=0.0, weight=kind, critic_lr=0.0, value_lr=0.0, **options)
-    agent = wpc.Agent(n, 1, 1.0, args)
-    for parameter in agent.parameters():
-        parameter.data.zero_()
-    hidden = torch.eye(256)[: 2 * n]
-    agent.critic.q1_net[0].weight.data[: 2 * n, :n] = torch.cat(
-        [torch.eye(n), -torch.eye(n)]
-    )
-    agent.critic.q1_net[2].weight.data[: 2 * n] = hidden
-    scale = torch.tensor(ADVANTAGES)
-    agent.critic.q1_net[4].weight.data[0, :n] = scale  # Q1(s, a) = advantage of s
-    agent.actor.net[0].weight.data[:n] = torch.eye(256)[:n, :n]
-    agent.actor.net[2].weight.data[:n] = torch.eye(256)[:n]
-    states = torch.eye(n)  # entry i of the batch alone reaches weight i of the policy
-    column = torch.zeros(n, 1)
-    batch = {
-        "observations": states,
-        "actions": column + 1,
-        "rewards": column,
-        "next_observations": states,
-        "terminals": column,
-    }
-    torch.manual_seed(seed)
-    agent.update(batch, step=2)
-    gradient = agent.actor.net[4].weight.grad[0, :n]
-    return (-gradient * n / 2).numpy()
+ADVANTAGES = torch.tensor([[-1e4], [-2.0], [-1e-3], [0.0], [1e-3], [0.5], [3.0], [1e4]])
 
 
-def test_binary_weight():
-    assert weights_of("binary").tolist() == [0, 0, 0, 0, 1, 1, 1, 1]  # eq. 7: A > 0
+def other_weight(**options):
+    """wpc's weights of these advantages."""
+    weight = (ADVANTAGES > 0).float()
+    return wpc.other_weight(weight, ADVANTAGES, {}, wpc.Args(**options))
 
 
 @pytest.mark.parametrize("beta", [1.0, 0.1, 10.0])
 def test_exponential_weight_is_cut_off_at_100(beta):
-    expected = np.exp(np.minimum(np.array(ADVANTAGES) / beta, np.log(100)))  # eq. 8
-    assert weights_of("exponential", beta=beta) == pytest.approx(expected, rel=1e-5)
+    expected = np.exp(np.minimum(ADVANTAGES.numpy() / beta, np.log(100)))  # eq. 8
+    weights = other_weight(weight="exponential", beta=beta).numpy()
+    assert weights == pytest.approx(expected, rel=1e-5)
 
 
 def test_random_weight_is_a_new_permutation_each_time():
-    draws = [weights_of("random", seed=seed).tolist() for seed in range(8)]
+    torch.manual_seed(0)
+    draws = [other_weight(weight="random").flatten().tolist() for _ in range(8)]
     assert all(sorted(draw) == [0] * 4 + [1] * 4 for draw in draws)
     assert len({tuple(draw) for draw in draws}) > 4
