@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: MIT
+"""D4RL's physics: by hand, and against the transitions that D4RL recorded."""
+
+import re
+import sys
+import zipfile
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, wpc, write_hdf5
+
+sys.path.insert(0, str(ROOT / "tests/tools"))
+import check_physics
+import play_zoo
+
+EPISODES = ROOT.parent / "shared/d4rl/episodes"
+
+robots = pytest.mark.parametrize("robot", wpc.D4RL_ROBOTS)
+needs_episodes = pytest.mark.skipif(
+    not EPISODES.exists(), reason=f"D4RL's recorded transitions aren't in {EPISODES}"
+)
+
+
+def recorded(robot):
+    """The first two episodes of D4RL's medium-v2 file, with qpos and qvel before each
+    action."""
+    return dict(np.load(EPISODES / f"{robot}_medium-v2.npz"))
+
+
+# By hand
+
+
+def cylinder(radius, half_length, density=1000):
+    """Mass and inertia tensor of the cylinder that MuJoCo 2.0 took for a capsule along
+    z: longer by half a radius at each end."""
+    length = 2 * half_length + radius
+    mass = density * np.pi * radius**2 * length
+    across = mass * (3 * radius**2 + length**2) / 12
+    return mass, np.diag([across, across, mass * radius**2 / 2])
+
+
+def rotation(quaternion):
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)
+
+
+def by_hand(model, body):
+    """Mass, center of mass and inertia tensor about it, of a body of the stock model
+    whose capsules weigh as in MuJoCo 2.0."""
+    parts = []
+    for i in range(model.ngeom):
+        if model.geom_bodyid[i] == body:
+            assert model.geom_type[i] == mujoco.mjtGeom.mjGEOM_CAPSULE
+            mass, inertia = cylinder(*model.geom_size[i, :2])
+            turn = rotation(model.geom_quat[i])
+            parts.append((mass, turn @ inertia @ turn.T, model.geom_pos[i]))
+    total = sum(mass for mass, _, _ in parts)
+    center = sum(mass * position for mass, _, position in parts) / total
+    tensor = np.zeros((3, 3))
+    for mass, inertia, position in parts:  # by the parallel axis theorem
+        d = position - center
+        tensor += inertia + mass * (d @ d * np.eye(3) - np.outer(d, d))
+    return total, center, tensor
+
+
+@robots
+def test_masses_and_inertias_by_hand(script, robot):
+    env_id, *_ = script.D4RL_ROBOTS[robot]
+    stock = script.make_envs(env_id, 1).envs[0].unwrapped.model
+    model = script.make_envs(robot, 1).envs[0].unwrapped.model
+    bodies = [by_hand(stock, body) for body in range(1, stock.nbody)]  # not the world
+    scale = 1.0
+    if robot == "halfcheetah":  # whose model sets the total mass
+        scale = 14 / sum(mass for mass, _, _ in bodies)
+        assert model.body_mass.sum() == pytest.approx(14)
+    for body, (mass, center, tensor) in enumerate(bodies, start=1):
+        assert model.body_mass[body] == pytest.approx(scale * mass)
+        assert model.body_ipos[body] == pytest.approx(center, abs=1e-9)
+        turn = rotation(model.body_iquat[body])
+        ours = turn @ np.diag(model.body_inertia[body]) @ turn.T
+        assert ours == pytest.approx(scale * tensor, rel=1e-6, abs=1e-9)
+    # what derives from the masses is computed again
+    assert model.body_subtreemass[0] == pytest.approx(model.body_mass.sum())
+    assert not np.allclose(model.dof_invweight0, stock.dof_invweight0, rtol=1e-3)
+
+
+@robots
+def test_margins_are_halved_and_collisions_keep_the_capsules(robot):
+    stock = wpc.make_envs(wpc.D4RL_ROBOTS[robot][0], 1).envs[0].unwrapped.model
+    model = wpc.make_envs(robot, 1).envs[0].unwrapped.model
+    assert np.array_equal(model.geom_margin, stock.geom_margin / 2)
+    assert (stock.geom_margin.max() > 0) == (robot == "hopper")
+    for name in ("geom_type", "geom_size", "geom_pos", "geom_quat"):
+        assert np.array_equal(getattr(model, name), getattr(stock, name))
+
+
+# Against D4RL
+
+
+def repeat(env, d4rl):
+    """The largest errors of next observation and reward, and the number of rows whose
+    termination differs, with every row's recorded qpos and qvel set."""
+    states, rewards, differ = [], [], 0
+    for i, action in enumerate(d4rl["actions"]):
+        env.unwrapped.set_state(d4rl["qpos"][i], d4rl["qvel"][i])
+        state, reward, terminated, _, _ = env.unwrapped.step(action)
+        states.append(state)
+        rewards.append(reward)
+        differ += terminated != d4rl["terminals"][i]
+    state_errors = np.abs(np.array(states) - d4rl["next_observations"])
+    return state_errors.max(), np.abs(rewards - d4rl["rewards"]).max(), differ
+
+
+@needs_episodes
+@robots
+def test_recorded_transitions(script, robot):
+    """They are repeated in D4RL's physics, and are not in the stock environment."""
+    d4rl = recorded(robot)
+    state_error, reward_error, differ = repeat(script.make_envs(robot, 1).envs[0], d4rl)
+    assert state_error < 1e-4 and reward_error < 2e-6 and differ == 0
+    env_id, *_ = script.D4RL_ROBOTS[robot]
+    state_error, reward_error, _ = repeat(script.make_envs(env_id, 1).envs[0], d4rl)
+    assert state_error > 0.1 and reward_error > 0.01
+
+
+# The tools
+
+
+def check(path, **options):
+    check_physics.main(check_physics.Args(path, **options))
+
+
+def read_table(text):
+    """The numbers of each row of the printed table, by the row's name."""
+    rows = [line.split("|")[1:-1] for line in text.splitlines() if "|" in line]
+    number = r"[\d.]+(?:e[-+]\d+)?"
+    return {
+        name.strip(): [float(x) for x in re.findall(number, " ".join(cells))]
+        for name, *cells in rows[2:]
+    }
+
+
+def read_counts(text):
+    return [int(x) for x in re.findall(r"(\d+) rows compared, (\d+)", text)[0]]
+
+
+@needs_episodes
+@robots
+def test_check_physics_on_a_file(tmp_path, capsys, robot):
+    """Of the recorded episodes, with their next observations and without."""
+    arrays = recorded(robot)
+    with_next = write_hdf5(tmp_path / "named_otherwise.hdf5", arrays)
+    arrays.pop("next_observations")
+    without = write_hdf5(tmp_path / f"{robot}_medium-v2.hdf5", arrays)
+    for path, options in ((with_next, {"env": robot}), (without, {})):
+        check(path, **options)
+        text = capsys.readouterr().out
+        rows, passed_over = read_counts(text)
+        assert rows + passed_over == len(arrays["rewards"])
+        assert passed_over == {"hopper": 150, "walker2d": 581}.get(robot, 0)
+        ours, stock = read_table(text).values()
+        assert ours[0] <= ours[1] < 1e-4 and ours[2] <= ours[3] < 2e-6 and ours[4] == 0
+        assert stock[1] > 0.1 and stock[3] > 0.01
+    # What follows the last row isn't known, if its episode goes on.
+    write_hdf5(without, {key: x[:400] for key, x in arrays.items()})
+    check(without)
+    ours, _ = read_table(capsys.readouterr().out).values()
+    assert ours[1] < 1e-4
+
+
+@needs_episodes
+def test_check_physics_finds_what_differs(tmp_path, capsys):
+    """One wrong number of each kind, and rows taken from the whole file."""
+    arrays = recorded("hopper")
+    seen = np.flatnonzero((np.abs(arrays["observations"]) < 10).all(axis=1))
+    arrays["next_observations"][seen[7], 3] += 0.5
+    arrays["rewards"][seen[8]] -= 0.25
+    arrays["terminals"][seen[-1]] ^= True
+    path = write_hdf5(tmp_path / "hopper.hdf5", arrays)
+    check(path)
+    ours = read_table(capsys.readouterr().out)["D4RL's physics"]
+    assert ours[0] < 1e-6 and ours[1] == pytest.approx(0.5, abs=0.01)
+    assert ours[2] < 1e-6 and ours[3] == pytest.approx(0.25, abs=0.01) and ours[4] == 1
+    assert seen[-1] == len(arrays["rewards"]) - 1
+    check(path, rows=2)  # the first and the last
+    text = capsys.readouterr().out
+    assert read_counts(text) == [2, 0] and read_table(text)["D4RL's physics"][4] == 1
+
+
+def test_what_check_physics_refuses(tmp_path):
+    path, arrays = tmp_path / "hopper.hdf5", {"observations": np.zeros((3, 5))}
+    arrays |= dict.fromkeys(("actions", "rewards", "terminals"), np.zeros(3))
+    write_hdf5(path, arrays)
+    with pytest.raises(SystemExit, match=r"hopper.hdf5: .*timeouts"):
+        check(path)
+    write_hdf5(path, arrays | {"timeouts": np.zeros(3)})
+    with pytest.raises(
+        SystemExit, match=r"has observations \(3, 5\): it isn't hopper's"
+    ):
+        check(path)
+    with pytest.raises(SystemExit, match=r"hopper_none.hdf5: .*No such file"):
+        check(tmp_path / "hopper_none.hdf5")
+    with pytest.raises(
+        SystemExit, match="must be one of halfcheetah, hopper, walker2d"
+    ):
+        check(tmp_path / "ant.hdf5")
+
+
+def test_play_zoo_plays_the_policy_of_the_zip(tmp_path, capsys):
+    """Here those of an Actor, under the names that rl-baselines3-zoo gives them."""
+    torch.manual_seed(0)
+    actor = wpc.Actor(11, 3, 1.0)
+    layers = ("latent_pi.0", 0), ("latent_pi.2", 2), ("mu", 4), ("log_std", 0)
+    policy = {
+        f"actor.{name}.{x}": getattr(actor.net[i], x).detach()
+        for name, i in layers
+        for x in ("weight", "bias")
+    }
+    torch.save(policy, tmp_path / "policy.pth")
+    path = tmp_path / "sac/Hopper-v3_1/Hopper-v3.zip"
+    path.parent.mkdir(parents=True)
+    with zipfile.ZipFile(path, "w") as file:
+        file.write(tmp_path / "policy.pth", "policy.pth")
+    play_zoo.main(play_zoo.Args([path], episodes=3))
+    printed = capsys.readouterr().out.splitlines()[-1]
+    cells = ["sac Hopper-v3"]
+    for env in ("hopper", "Hopper-v4"):
+        args, envs = wpc.Args(env=env, dataset="none"), wpc.make_envs(env, 3)
+        row = wpc.evaluate(envs, actor, torch.zeros(11), torch.ones(11), args)
+        cells.append(f"{row['mean_return']:.0f} +- {row['std_return']:.0f}")
+    assert cells[1] != cells[2]
+    assert printed == f"| {' | '.join(cells)} |"
+
+    for name in ("none/Hopper-v3.zip", "Ant-v3.zip"):
+        with pytest.raises(SystemExit, match=name):
+            play_zoo.main(play_zoo.Args([tmp_path / name]))
