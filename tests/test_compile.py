@@ -1,23 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""--compile: the same steps as without it, but for rounding, and the same runs.
+"""tests/tools/compiled.py: the same steps as the scripts' own, but for rounding, and
+the same runs.
 
 What is traced is tested for every script, weight and frequency; it is compiled to C++
 for wpc.py alone, as that takes a minute.
 """
 
+import importlib
 import shutil
-import signal
 import sys
 
 import pytest
 import torch
 from conftest import (
+    DATASET,
     ROOT,
+    as_bits,
     assert_one_sentence,
     command,
     load,
-    refusal,
-    result,
+    networks,
+    read_rows,
     run,
     start,
     td3_bc,
@@ -26,50 +29,65 @@ from conftest import (
     wpc,
 )
 
+sys.path.insert(0, str(ROOT / "tests/tools"))
+compiled = importlib.import_module("compiled")
+
 VARIANTS = [
     (script, {"policy_freq": n}) for script in (wpc, td3_bc, wbc) for n in (1, 2, 3)
 ]
 VARIANTS += [(wpc, {"weight": w}) for w in ("exponential", "random", "static")]
 
 
+@pytest.fixture
+def float64():
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
 def random_batch():
     return {
-        "observations": torch.randn(32, 5).double(),
-        "actions": 2 * torch.rand(32, 2).double() - 1,
-        "rewards": torch.randn(32, 1).double(),
-        "next_observations": torch.randn(32, 5).double(),
-        "terminals": (torch.rand(32, 1) < 0.1).double(),
-        "better_half": (torch.rand(32, 1) < 0.5).double(),
+        "observations": torch.randn(32, 5),
+        "actions": 2 * torch.rand(32, 2) - 1,
+        "rewards": torch.randn(32, 1),
+        "next_observations": torch.randn(32, 5),
+        "terminals": (torch.rand(32, 1) < 0.1).to(torch.get_default_dtype()),
+        "better_half": (torch.rand(32, 1) < 0.5).to(torch.get_default_dtype()),
     }
 
 
-def twenty_steps(script, args, compiled):
-    """The last metrics, the last gradients, and what is saved, in float64."""
+def state(agent):
+    return {k: x.state_dict() for k, x in vars(agent).items() if k != "args"}
+
+
+def twenty_steps(script, args, compile_update=None):
+    """The metrics of each step, and what is saved after the last."""
     torch.manual_seed(0)
-    agent = script.Agent(5, 2, 1.0, args).double()
-    update = script.compile_update(agent) if compiled else agent.update
+    agent = script.Agent(5, 2, 1.0, args)
+    update = agent.update
+    if compile_update:
+        update = compile_update(agent, script.Agent.update)
+    metrics = []
     for step in range(1, 21):
-        metrics = update(random_batch(), step)
-    gradients = {
-        name: p.grad for name, p in agent.named_parameters() if p.requires_grad
-    }
-    return metrics, gradients, script.training_state(agent)
+        metrics.append({k: x.item() for k, x in update(random_batch(), step).items()})
+    return metrics, state(agent)
 
 
 @pytest.mark.parametrize("script, options", VARIANTS)
-def test_the_traced_step_is_the_step(monkeypatch, script, options):
+def test_the_traced_step_is_the_step(float64, monkeypatch, script, options):
     real_compile = torch.compile
 
     def only_trace(function, options, **arguments):
         return real_compile(function, backend="eager", **arguments)
 
     monkeypatch.setattr(torch, "compile", only_trace)
+    if script is wpc:
+        gathered = compiled.gathered(wpc.other_weight)
+        monkeypatch.setattr(wpc, "other_weight", gathered)
     torch._dynamo.reset()
-    args = script.Args(**options)
-    if script is not wbc:
-        args.alpha = 2.5
-    eager = twenty_steps(script, args, compiled=False)
-    traced = twenty_steps(script, args, compiled=True)
+    args = script.Args(device="cpu", **options)
+    eager = twenty_steps(script, args)
+    traced = twenty_steps(script, args, compiled.compile_update)
     torch.testing.assert_close(traced, eager, rtol=1e-9, atol=1e-12)
 
 
@@ -80,7 +98,7 @@ import torch._inductor.config
 from torch._inductor.compile_fx import compile_fx
 
 sys.path.insert(0, "tests")
-from test_compile import twenty_steps, wpc
+from test_compile import compiled, twenty_steps, wpc
 
 
 def run_graph(graph, *_, **__):
@@ -94,8 +112,10 @@ def prepare(graph, inputs):
 real_compile = torch.compile
 torch.compile = lambda f, options, **others: real_compile(f, backend=prepare, **others)
 torch._inductor.config.fallback_random = True
-args = wpc.Args(alpha=2.5, weight="random", policy_freq=1)
-eager, prepared = (twenty_steps(wpc, args, compiled) for compiled in (False, True))
+torch.set_default_dtype(torch.float64)
+wpc.other_weight = compiled.gathered(wpc.other_weight)
+args = wpc.Args(device="cpu", weight="random", policy_freq=1)
+eager, prepared = (twenty_steps(wpc, args, c) for c in (None, compiled.compile_update))
 torch.testing.assert_close(prepared, eager, rtol=1e-9, atol=1e-12)
 """
 
@@ -107,15 +127,23 @@ def test_pytorchs_compiler_takes_the_random_weight():
     assert process.returncode == 0, process.stderr
 
 
-def test_a_continued_adam_has_the_same_powers_of_its_betas(script):
+def test_the_random_weight_is_the_scripts():
+    weight, args = torch.rand(50, 1), wpc.Args(weight="random")
+    torch.manual_seed(0)
+    ours = compiled.gathered(wpc.other_weight)(weight, None, None, args)
+    torch.manual_seed(0)
+    assert torch.equal(ours, wpc.other_weight(weight, None, None, args))
+
+
+def test_a_continued_adam_has_the_same_powers_of_its_betas():
     """To the last bit, which beta**t is not: each step rounds."""
     parameter = torch.nn.Parameter(torch.zeros(1))
     optimizer = torch.optim.Adam([parameter])
-    fresh = script.TraceableAdam(optimizer)
+    fresh = compiled.TraceableAdam(optimizer)
     for _ in range(5000):
         parameter.grad = torch.ones(1)
         fresh.step()
-    continued = script.TraceableAdam(optimizer)
+    continued = compiled.TraceableAdam(optimizer)
     assert optimizer.state[parameter]["step"] == 5000
     assert torch.equal(continued.beta1_power, fresh.beta1_power)
     assert torch.equal(continued.beta2_power, fresh.beta2_power)
@@ -123,38 +151,43 @@ def test_a_continued_adam_has_the_same_powers_of_its_betas(script):
     assert continued.beta2_power.item() != 0.999**5000
 
 
+def compiled_command(*arguments):
+    python, script, *flags = command("wpc", *arguments)
+    return [python, str(ROOT / "tests/tools/compiled.py"), script, *flags]
+
+
 def assert_equal_but_for_rounding(run_dir, other):
     ours, theirs = load(run_dir), load(other)
-    for key in ("networks", "optimizers"):
-        torch.testing.assert_close(ours[key], theirs[key], rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(ours["agent"], theirs["agent"], rtol=1e-3, atol=1e-4)
     assert torch.equal(ours["rng_state"], theirs["rng_state"])
 
 
 def test_compiled_runs(finished, run_dir, tmp_path):
     """One test, as the first run compiles for a minute and the others use its code."""
-    compiled, stopped, switched = (tmp_path / name for name in "abc")
-    process = run(*command("wpc", "--run-dir", compiled, "--compile"))
-    assert process.returncode == 0 and process.stderr == "", process.stderr
-    assert "compiling, which takes about a minute" in process.stdout
-    assert_equal_but_for_rounding(compiled, finished)
-    assert result(compiled) != result(finished)  # or nothing was compiled
-
-    # Stopped by a signal and continued, a run ends as it would have.
-    process = start(*command("wpc", "--run-dir", stopped, "--compile"))
-    wait_until((stopped / "checkpoint.pt").exists, process)
-    process.send_signal(signal.SIGTERM)
-    process.communicate()
-    assert load(stopped)["step"] < 60
-    process = run(*command("wpc")[:2], "--run-dir", stopped)
+    whole, killed, switched = (tmp_path / name for name in "abc")
+    process = run(*compiled_command("--run-dir", whole))
     assert process.returncode == 0, process.stderr
-    assert result(stopped) == result(compiled)
+    assert_equal_but_for_rounding(whole, finished)
+    assert read_rows(whole) != read_rows(finished)  # or nothing was compiled
+
+    # Killed and continued, a run ends as it would have.
+    process = start(*compiled_command("--run-dir", killed))
+    wait_until((killed / "checkpoint.pt").exists, process)
+    process.kill()
+    process.communicate()
+    assert load(killed)["step"] < 60
+    process = run(*compiled_command("--run-dir", killed))
+    assert process.returncode == 0, process.stderr
+    assert as_bits(load(killed)) == as_bits(load(whole))
+    assert read_rows(killed) == read_rows(whole)
 
     # From step 60 on, one run is compiled and another is no longer.
-    shutil.copytree(compiled, switched)
-    for folder, flag in ((run_dir, "--compile"), (switched, "--no-compile")):
-        line = command("wpc", "--run-dir", folder, flag, "--max-timesteps", 70)
-        process = run(*line)
-        assert process.returncode == 0, process.stderr
+    shutil.copytree(whole, switched)
+    more = ("--max-timesteps", 70)
+    process = run(*compiled_command("--run-dir", run_dir, *more))
+    assert process.returncode == 0, process.stderr
+    process = run(*command("wpc", "--run-dir", switched, *more))
+    assert process.returncode == 0, process.stderr
     assert_equal_but_for_rounding(run_dir, switched)
 
 
@@ -162,12 +195,75 @@ def test_compiled_runs(finished, run_dir, tmp_path):
 def test_without_a_compiler(monkeypatch, tmp_path, compiler):
     monkeypatch.setenv("CXX", compiler)
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "empty"))
-    process = run(*command("wpc", "--run-dir", tmp_path / "run", "--compile"))
-    assert_one_sentence(process, "--compile failed (")
-    assert not (tmp_path / "run/checkpoint.pt").exists()
+    process = run(*compiled_command("--run-dir", tmp_path / "run"))
+    assert_one_sentence(process, "compiling needs a C++ compiler")
 
 
-def test_not_on_a_gpu(monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    line = command("wpc", "--compile", "--device", "cuda")
-    assert "--compile is for CPUs" in refusal(wpc, *line)
+def test_where_the_cache_cannot_be_written(monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "file/cache"))
+    process = run(*compiled_command("--run-dir", tmp_path / "run"))
+    assert_one_sentence(process, "TORCHINDUCTOR_CACHE_DIR")
+
+
+@pytest.mark.parametrize("arguments", [[], ["nothing.py"]])
+def test_a_script_must_be_named(arguments):
+    process = run(sys.executable, ROOT / "tests/tools/compiled.py", *arguments)
+    assert_one_sentence(process, "name a script: python tests/tools/compiled.py wpc.py")
+
+
+class PretendGraph:
+    """Does at each replay what was done while it was captured."""
+
+    capturing = None
+
+    def replay(self):
+        self.steps()
+
+
+def test_graphs_on_a_gpu_do_the_scripts_steps(monkeypatch, script):
+    """Their bookkeeping, with stand-ins for CUDA: sampling and update are done once a
+    step, in the script's order, with and without the policy's update in turn."""
+    done = []
+
+    class Agent:
+        args = script.Args(device="cpu", policy_freq=3)
+
+    def update(agent, batch, step):
+        done.append((batch, step % 3 == 0))
+        return {"q": torch.zeros(())}
+
+    class Capture:
+        def __init__(self, graph, stream):
+            self.graph = graph
+
+        def __enter__(self):
+            self.before = len(done)
+
+        def __exit__(self, *_):
+            captured = done[self.before :]
+            del done[self.before :]  # nothing runs while a graph is captured
+            self.graph.steps = lambda: done.extend(captured)
+
+    class Stream:
+        def __enter__(self):
+            pass
+
+        def __exit__(self, *_):
+            pass
+
+    monkeypatch.setattr(torch.cuda, "Stream", Stream)
+    monkeypatch.setattr(torch.cuda, "stream", lambda stream: stream)
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", PretendGraph)
+    monkeypatch.setattr(torch.cuda, "graph", Capture)
+    graphs = compiled.Graphs(Agent(), update, lambda dataset, size: (dataset, size))
+    for step in range(1, 31):
+        assert "q" in graphs("dataset", step)
+    assert done == [(("dataset", 256), step % 3 == 0) for step in range(1, 31)]
+    assert len(graphs.graphs) == 2
+
+
+def test_the_scripts_agents_are_those_of_networks():
+    """`state` above misses nothing: all of an agent but its arguments is saved."""
+    agent = wpc.Agent(5, 2, 1.0, wpc.Args(device="cpu", dataset=str(DATASET)))
+    assert len(networks(agent)) == 5 and len(state(agent)) == 8

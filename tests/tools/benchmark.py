@@ -1,60 +1,58 @@
 # SPDX-License-Identifier: MIT
-"""Training speed of the scripts, plain and with --compile, against a textbook loop and
-against the bare matrix products of a step; then evaluation, loading, start-up, and runs
-side by side.
+"""Training speed of the scripts, plain and compiled, beside a textbook loop, the bare
+matrix products of a step, and other people's files.
 
     python tests/tools/benchmark.py
-    python tests/tools/benchmark.py --peers TD3_BC/TD3_BC.py wPC/TD3_wBC.py
+    python tests/tools/benchmark.py --peers TD3_BC/TD3_BC.py wPC/TD3_wBC.py \\
+        --jax JAX-CORL/algos/td3bc.py
 
-The second line also measures files of https://github.com/sfujim/TD3_BC and
-https://github.com/qsa-fox/wPC, which you download yourself. All variants take turns in
-one process, so that whatever else the machine does meets all of them. Ratios of medians
-come first, as they carry over to other machines.
+The second line also measures files of github.com/sfujim/TD3_BC, github.com/qsa-fox/wPC
+and github.com/nissymori/JAX-CORL, which you download yourself; the last needs jax, flax
+and optax. All variants take turns, so that whatever else the machine does meets all of
+them. Ratios of medians come first, as they carry over to other machines.
 """
 
-import csv
 import importlib.util
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import h5py
 import numpy as np
 import torch
 import torch.nn.functional as F
 import tyro
+from compiled import compile_update
+from tqdm import trange
 
-ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT))
-import td3_bc  # noqa: E402
-import wbc  # noqa: E402
-import wpc  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[2]))
+import td3_bc
+import wbc
+import wpc
 
 STATE_DIM, ACTION_DIM = 11, 3  # Hopper's
 BATCH, ROWS = 256, 200_000
-DATASET = ROOT / "tests/data/halfcheetah_replay.hdf5"
 
 
 @dataclass
 class Args:
     rounds: int = 10
-    """turns of each variant"""
+    """number of turns of each variant"""
     steps: int = 40
-    """training steps of a turn"""
+    """number of training steps in a turn"""
     peers: list[Path] = field(default_factory=list)
     """other files to measure, with a class TD3_BC as TD3_BC.py has it"""
+    jax: Path | None = None
+    """JAX-CORL's td3bc.py"""
 
 
 def script_steps(script, compiled):
-    """A script's own update, and its own sampling."""
-    args = script.Args()
-    args.alpha = 2.5
+    """A script's own sampling and update."""
+    args = script.Args(device="cpu")
     agent = script.Agent(STATE_DIM, ACTION_DIM, 1.0, args)
-    update = script.compile_update(agent) if compiled else agent.update
+    update = compile_update(agent, script.Agent.update) if compiled else agent.update
     dataset = {
         "observations": torch.randn(ROWS, STATE_DIM),
         "actions": torch.rand(ROWS, ACTION_DIM) * 2 - 1,
@@ -85,6 +83,70 @@ def peer_steps(path):
     spec.loader.exec_module(module)
     agent, buffer = module.TD3_BC(STATE_DIM, ACTION_DIM, 1.0), Buffer()
     return lambda i: agent.train(buffer, BATCH)
+
+
+JAX = """
+import functools, sys, time, types
+
+path, threads, layer_norm, rows, state_dim, action_dim = sys.argv[1:]
+for name in ("d4rl", "distrax", "gym", "wandb"):  # imported, but not needed here
+    sys.modules[name] = types.ModuleType(name)
+sys.modules["gym"].Env = object
+sys.argv = sys.argv[:1]
+import jax
+
+program = open(path).read()
+if layer_norm == "False":
+    assert program.count("layer_norm=True") == 2
+    program = program.replace("layer_norm=True", "layer_norm=False")
+module = types.ModuleType("peer")
+exec(compile(program, path, "exec"), module.__dict__)
+config, key = module.config, jax.random.PRNGKey(0)
+draw = functools.partial(jax.random.normal, key)
+rows, state_dim, action_dim = int(rows), int(state_dim), int(action_dim)
+data = module.Transition(
+    draw((rows, state_dim)),
+    draw((rows, action_dim)),
+    draw((rows,)),
+    draw((rows, state_dim)),
+    0 * draw((rows,)),
+)
+state = module.create_td3bc_train_state(
+    key, data.observations[0], data.actions[0], config
+)
+update = jax.jit(module.TD3BC().update_n_times, static_argnums=(3,))
+for line in sys.stdin:
+    calls = int(line) // config.n_jitted_updates
+    start = time.perf_counter()
+    for _ in range(calls):
+        key, own = jax.random.split(key)
+        state, _ = update(state, data, own, config)
+    jax.block_until_ready(state.actor.params)
+    print(calls * config.n_jitted_updates, time.perf_counter() - start, flush=True)
+"""
+
+
+class JaxSteps:
+    """JAX-CORL's training steps, in a process of its own on so many cores."""
+
+    def __init__(self, path, threads, layer_norm):
+        sizes = (ROWS, STATE_DIM, ACTION_DIM)
+        line = [sys.executable, "-c", JAX, path, threads, layer_norm, *sizes]
+        cores = sorted(os.sched_getaffinity(0))[:threads]
+        self.process = subprocess.Popen(
+            [str(x) for x in line],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"JAX_PLATFORMS": "cpu"},
+            preexec_fn=lambda: os.sched_setaffinity(0, cores),
+        )
+
+    def run(self, steps):
+        self.process.stdin.write(f"{steps}\n")
+        self.process.stdin.flush()
+        done, seconds = self.process.stdout.readline().split()
+        return int(done) / float(seconds)
 
 
 def textbook_steps():
@@ -169,33 +231,52 @@ def product_steps():
     return step
 
 
-def steps_per_second(variants, args):
-    """The median speed of each variant over its turns."""
-    for step in variants.values():
-        step(1)  # compiles what is to be compiled
-        step(2)
-    speeds = {name: [] for name in variants}
-    for _ in range(args.rounds):
-        for name, step in variants.items():
-            start = time.perf_counter()
-            for i in range(1, args.steps + 1):
-                step(i)
-            speeds[name].append(args.steps / (time.perf_counter() - start))
-    return {name: float(np.median(speed)) for name, speed in speeds.items()}
+class Steps:
+    """Training steps in this process."""
+
+    def __init__(self, step):
+        self.step = step
+
+    def run(self, steps):
+        """Does so many steps; returns steps a second."""
+        start = time.perf_counter()
+        for i in range(1, steps + 1):
+            self.step(i)
+        return steps / (time.perf_counter() - start)
 
 
-def benchmark_steps(args):
-    """Prints a table with a row for each variant; returns wpc's speed on one thread."""
-    columns = {}
-    for threads in sorted({1, os.cpu_count()}):
+def variants(args, threads):
+    made = {"textbook": Steps(textbook_steps()), "products": Steps(product_steps())}
+    for script in (wpc, td3_bc, wbc):
+        name = script.SCRIPT.name
+        made[name] = Steps(script_steps(script, compiled=False))
+        made[f"compiled {name}"] = Steps(script_steps(script, compiled=True))
+    made |= {path.name: Steps(peer_steps(path)) for path in args.peers}
+    if args.jax:
+        made["JAX-CORL"] = JaxSteps(args.jax, threads, True)
+        made["JAX-CORL, no LayerNorm"] = JaxSteps(args.jax, threads, False)
+    return made
+
+
+def main(args: Args):
+    torch.set_flush_denormal(True)
+    columns, all_cores = {}, os.sched_getaffinity(0)
+    for threads in sorted({1, len(all_cores)}):
+        os.sched_setaffinity(0, sorted(all_cores)[:threads])
         torch.set_num_threads(threads)
         torch._dynamo.reset()  # what is compiled depends on the number of threads
-        variants = {"textbook": textbook_steps(), "products": product_steps()}
-        for script in (wpc, td3_bc, wbc):
-            variants[script.SCRIPT] = script_steps(script, compiled=False)
-            variants[f"{script.SCRIPT} --compile"] = script_steps(script, compiled=True)
-        variants |= {path.name: peer_steps(path) for path in args.peers}
-        columns[threads] = steps_per_second(variants, args)
+        made = variants(args, threads)
+        for variant in made.values():
+            variant.run(args.steps)  # compiles what is to be compiled
+        speeds = {name: [] for name in made}
+        for _ in trange(args.rounds, desc=f"{threads} thread(s)"):
+            for name, variant in made.items():
+                speeds[name].append(variant.run(args.steps))
+        columns[threads] = {name: np.median(speed) for name, speed in speeds.items()}
+        for variant in made.values():
+            if isinstance(variant, JaxSteps):
+                variant.process.kill()
+        os.sched_setaffinity(0, all_cores)
     header = "| "
     for threads in columns:
         header += f"| {threads} thread(s): / textbook | steps/s "
@@ -205,109 +286,6 @@ def benchmark_steps(args):
         for speed in columns.values():
             row += f"| {speed[name] / speed['textbook']:.2f} | {speed[name]:.0f} "
         print(f"{row}|")
-    return columns[1]["wpc"]
-
-
-def benchmark_evaluation(speed):
-    """The share of evaluation in a run: every 5,000 steps, 10 full-length episodes."""
-    for robot, state_dim, action_dim in (("hopper", 11, 3), ("walker2d", 17, 6)):
-        envs = wpc.make_envs(robot, 10)
-        for env in envs.envs:  # full-length episodes, whatever the policy
-            env.unwrapped._terminate_when_unhealthy = False
-        actor = wpc.Actor(state_dim, action_dim, 1.0)
-        mean, std = torch.zeros(state_dim), torch.ones(state_dim)
-        times = []
-        for seed in range(3):
-            start = time.perf_counter()
-            wpc.evaluate(envs, actor, mean, std, seed)
-            times.append(time.perf_counter() - start)
-        seconds = float(np.median(times))
-        share = seconds / (seconds + 5000 / speed)
-        print(f"evaluation, {robot}: {seconds:.2f} s, {100 * share:.1f}% of a run")
-
-
-LOAD = """
-import time, wpc
-start = time.perf_counter()
-dataset, _ = wpc.load_dataset({path!r}, {state_dim}, {action_dim}, wpc.Args())
-wpc.normalize_states(dataset)
-seconds = time.perf_counter() - start
-print(f"{{len(dataset['rewards']):,}} transitions in {{seconds:.1f}} s")
-"""
-
-
-def benchmark_loading(folder):
-    """Hopper's and HalfCheetah's largest datasets, each in a fresh process."""
-    for rows, state_dim, action_dim in ((1_000_000, 11, 3), (2_000_000, 17, 6)):
-        path = folder / "data.hdf5"
-        rng = np.random.default_rng(0)
-        with h5py.File(path, "w") as file:
-            file["observations"] = rng.random((rows, state_dim), np.float32)
-            file["actions"] = rng.random((rows, action_dim), np.float32)
-            file["rewards"] = np.ones(rows, np.float32)
-            file["terminals"] = np.zeros(rows, bool)
-            file["timeouts"] = np.arange(rows) % 1000 == 999
-        program = LOAD.format(
-            path=str(path), state_dim=state_dim, action_dim=action_dim
-        )
-        line = [sys.executable, "-c", program]
-        output = subprocess.run(line, cwd=ROOT, capture_output=True, check=True).stdout
-        print(f"loading: {output.decode().strip()}")
-
-
-def run_line(run_dir, *arguments):
-    line = [sys.executable, ROOT / "wpc.py", "--env", "halfcheetah", "--device", "cpu"]
-    line += ["--dataset", DATASET, "--eval-episodes", 1, "--run-dir", run_dir]
-    return [str(x) for x in (*line, *arguments)]
-
-
-def benchmark_start(folder):
-    """A whole run of one step and one evaluation of one episode."""
-    times = []
-    for i in range(3):
-        start = time.perf_counter()
-        line = run_line(folder / str(i), "--max-timesteps", 1)
-        subprocess.run(line, capture_output=True, check=True)
-        times.append(time.perf_counter() - start)
-    print(f"a run of one step: {np.median(times):.1f} s")
-
-
-def run_together(folder, runs, threads, steps):
-    """Steps a second, all together, of runs at the same time."""
-    environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
-    options = ["--max-timesteps", steps, "--log-freq", steps]
-    folders = [folder / f"{runs}_{threads}_{i}" for i in range(runs)]
-    processes = [
-        subprocess.Popen(
-            run_line(run_dir, *options), stdout=subprocess.DEVNULL, env=environment
-        )
-        for run_dir in folders
-    ]
-    assert all(process.wait() == 0 for process in processes)
-    speed = 0
-    for run_dir in folders:
-        row = list(csv.DictReader((run_dir / "evaluations.csv").open()))[-1]
-        speed += float(row["steps_per_second"])
-    return speed
-
-
-def benchmark_side_by_side(folder, args):
-    """One run with all threads, against as many runs with one thread each."""
-    cores, steps = os.cpu_count(), 20 * args.steps
-    together = run_together(folder, cores, 1, steps)
-    alone = run_together(folder, 1, cores, steps)
-    print(f"{cores} runs with one thread each: {together:.0f} steps/s together")
-    print(f"1 run with {cores} threads: {alone:.0f} steps/s")
-
-
-def main(args: Args):
-    torch.set_flush_denormal(True)
-    speed = benchmark_steps(args)
-    benchmark_evaluation(speed)
-    with tempfile.TemporaryDirectory() as folder:
-        benchmark_loading(Path(folder))
-        benchmark_start(Path(folder))
-        benchmark_side_by_side(Path(folder), args)
 
 
 if __name__ == "__main__":
