@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: MIT
+"""tests/tools/together.py: runs that are trained as one are the scripts' runs."""
+
+import csv
+import importlib
+import json
+import shlex
+import sys
+
+import pytest
+import torch
+from conftest import DATASET, ROOT, run, td3_bc, wbc, wpc
+
+sys.path.insert(0, str(ROOT / "tests/tools"))
+together = importlib.import_module("together")
+
+SMALL, LARGE = (5, 2, 1.0), (7, 3, 1.0)
+OPTIONS = {"device": "cpu", "policy_noise": 0.0, "batch_size": 16}
+# Without noise, which is drawn for all runs together.
+RUNS = [
+    (wpc, LARGE, {"alpha": 2.5}),
+    (wpc, SMALL, {"alpha": 0.1, "seed": 1}),
+    (td3_bc, SMALL, {"alpha": 1.0}),
+    (td3_bc, LARGE, {"alpha": 0.0, "seed": 2}),
+    (wbc, SMALL, {"seed": 3}),
+    (wbc, LARGE, {}),
+    (wpc, SMALL, {"alpha": 2.5, "weight": "exponential", "beta": 1.0}),
+    (wpc, LARGE, {"alpha": 2.5, "weight": "static"}),
+]
+
+
+@pytest.fixture
+def float64():
+    torch.set_default_dtype(torch.float64)
+    other_weight = wpc.other_weight
+    yield
+    torch.set_default_dtype(torch.float32)
+    wpc.other_weight = other_weight
+
+
+def make_dataset(dims, rows=100):
+    state_dim, action_dim, _ = dims
+    return {
+        "observations": torch.randn(rows, state_dim),
+        "actions": torch.randn(rows, action_dim).tanh(),
+        "rewards": torch.randn(rows, 1),
+        "next_observations": torch.randn(rows, state_dim),
+        "terminals": (torch.rand(rows, 1) < 0.1).double(),
+        "better_half": (torch.rand(rows, 1) < 0.5).double(),
+    }
+
+
+def make_runs():
+    torch.manual_seed(0)
+    datasets = {dims: make_dataset(dims) for dims in (SMALL, LARGE)}
+    all_dims = [dims for _, dims, _ in RUNS]
+    data = [(datasets[dims], None, None, 0.0) for dims in all_dims]
+    args = [script.Args(**OPTIONS, **options) for script, _, options in RUNS]
+    return together.Runs(args, all_dims, data, "cpu")
+
+
+def test_each_run_is_trained_as_by_its_script(float64):
+    runs, singles = make_runs(), []
+    for (script, dims, _), args in zip(RUNS, runs.runs, strict=True):
+        torch.manual_seed(args.seed)
+        singles.append(script.Agent(*dims, args))
+    traced, wpc.other_weight = wpc.other_weight, together.WPC_WEIGHT
+    for step in range(1, 11):
+        indices = torch.randint(100, (len(RUNS), 16))
+        rows = runs.start + indices
+        wpc.other_weight = traced
+        runs.update({name: x[rows] for name, x in runs.columns.items()}, step)
+        wpc.other_weight = together.WPC_WEIGHT
+        for i, (single, (dataset, *_)) in enumerate(
+            zip(singles, runs.data, strict=True)
+        ):
+            batch = {name: column[indices[i]] for name, column in dataset.items()}
+            for name, metric in single.update(batch, step).items():
+                ours = runs.metrics[name].flatten()[i].item()
+                assert ours == pytest.approx(metric.item(), rel=1e-9, abs=1e-12)
+    for i, (single, own) in enumerate(zip(singles, runs.actors, strict=True)):
+        for network in (runs.agent.actor, runs.agent.actor_target):
+            network.net.copy_to(i, own.net)
+            expected = (
+                single.actor if network is runs.agent.actor else single.actor_target
+            )
+            for key, tensor in expected.state_dict().items():
+                torch.testing.assert_close(own.state_dict()[key], tensor)
+        critic = wpc.Critic(*RUNS[i][1][:2])
+        for network in ("critic", "critic_target"):
+            for q, net in enumerate((critic.q1_net, critic.q2_net)):
+                row = i + q * len(RUNS)
+                getattr(runs.agent, network).net.copy_to(row, net)
+            for key, tensor in getattr(single, network).state_dict().items():
+                torch.testing.assert_close(critic.state_dict()[key], tensor)
+
+
+def test_the_traced_steps_are_the_steps(float64):
+    plain, traced = make_runs(), make_runs()
+    torch.manual_seed(1)
+    for _ in range(6):
+        plain.two_steps()
+    torch.manual_seed(1)
+    traced.compile(lambda graph, inputs: graph)
+    traced.do(10)
+    for name, network in traced.agent.actor.named_parameters():
+        expected = plain.agent.actor.get_parameter(name)
+        torch.testing.assert_close(network, expected)
+    assert traced.metrics.keys() == plain.metrics.keys()
+    for name, metric in traced.metrics.items():
+        torch.testing.assert_close(metric, plain.metrics[name])
+
+
+def test_the_random_weight_is_permuted_within_each_run():
+    other_weight = together.weight_of_each_run(["random", "binary", "random", "one"])
+    weight = torch.tensor([0.0, 0.0, 1.0]).repeat(4, 1)[..., None]
+    draws = [other_weight(weight, None, None, None).squeeze(-1) for _ in range(30)]
+    for draw in draws:
+        assert draw[0].sum() == draw[2].sum() == 1
+        assert draw[1].tolist() == [0, 0, 1] and draw[3].tolist() == [1, 1, 1]
+    assert {tuple(draw[0].tolist()) for draw in draws} == {
+        (1, 0, 0),
+        (0, 1, 0),
+        (0, 0, 1),
+    }
+    assert any((draw[0] != draw[2]).any() for draw in draws)
+
+
+def test_each_run_leaves_what_its_script_leaves(tmp_path):
+    flags = f"--env halfcheetah --dataset {DATASET} --device cpu --eval-episodes 1 "
+    flags += "--max-timesteps 20 --eval-freq 10"
+    lines = [
+        f"python {name}.py {flags} --seed {seed} --run-dir {tmp_path / name}{seed}"
+        for name in ("wpc", "td3_bc", "wbc")
+        for seed in (0, 1)
+    ]
+    (tmp_path / "commands.txt").write_text("\n".join(lines))
+    line = [sys.executable, ROOT / "tests/tools/together.py"]
+    line += [tmp_path / "commands.txt", "--workers", 1, "--no-compile"]
+    process = run(*line, cwd=ROOT)
+    assert process.returncode == 0, process.stderr
+    columns = {}
+    for line in lines:
+        folder = tmp_path / shlex.split(line)[-1]
+        rows = list(csv.DictReader((folder / "evaluations.csv").open()))
+        assert [row["step"] for row in rows] == ["0", "10", "20"]
+        assert float(rows[-1]["normalized_score"]) < 5 < float(rows[-1]["best_return"])
+        columns[folder.name] = rows[0].keys()
+        args = json.loads((folder / "args.json").read_text())
+        assert args["made_by"] == "tests/tools/together.py"
+        assert str(args["seed"]) == folder.name[-1]
+    assert {"q", "v", "weight", "lmbda"} <= columns["wpc0"]
+    assert "lmbda" in columns["td3_bc0"] and "v" not in columns["td3_bc0"]
+    assert "weight" in columns["wbc1"] and "lmbda" not in columns["wbc1"]
