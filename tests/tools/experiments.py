@@ -2,21 +2,25 @@
 """The paper's experiments: the commands to run, and a report on what they left.
 
     python tests/tools/experiments.py list table1 --runs runs/paper > commands.txt
-    xargs -P 2 -I{} sh -c "{}" < commands.txt
+    tr '\\n' '\\0' < commands.txt | xargs -0 -n 1 -P 2 sh -c
     python tests/tools/experiments.py report --runs runs/paper --out report
 
-`list` starts nothing. Run its lines again, and what was interrupted is continued.
-`report` writes tables.md and those of Figures 2 to 5 that the runs can show.
+`list` starts nothing; the second line runs what it lists, two at a time, and continues
+what was interrupted. With a GPU, tests/tools/together.py trains many of these runs at
+once. `report` reads every run folder below --runs, whatever its name.
 """
 
 import csv
+import importlib
+import itertools
 import json
 import math
+import re
 import shlex
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import matplotlib
 
@@ -26,351 +30,490 @@ import numpy as np
 import tyro
 from scipy import stats
 
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))  # the scripts know their defaults
 TASKS = [
-    f"{robot}-{kind}-v2"
+    f"{robot}-{kind}"
     for kind in ("random", "medium", "medium-replay", "medium-expert")
     for robot in ("halfcheetah", "hopper", "walker2d")
 ]
-PAPER = {
-    # Tables 1 and 2 of the paper, task by task: 5 seeds, 1,000,000 steps, D4RL's files
-    "td3_bc": "11.7 8.6 0.9 48.2 57.7 83.2 44.6 67.4 83.7 90.7 106.1 110.1",
-    "wbc": "2.2 10.5 12.1 45.6 64.2 81.0 41.1 86.6 61.2 92.5 105.8 109.9",
-    "wpc-exponential": "16.0 9.1 4.4 48.6 67.0 83.8 44.6 88.9 85.6 91.5 103.0 110.2",
-    "wpc-random": "15.5 7.9 0.2 50.5 66.5 59.3 47.0 78.5 77.1 75.0 59.6 103.1",
-    "wpc": "19.6 19.9 0.7 53.3 86.5 86.0 48.3 97.0 89.9 93.7 95.7 110.1",
+PUBLISHED = {
+    # Tables 1 and 2 of the paper, task by task: D4RL's files, five seeds, 1,000,000
+    # steps. CORL's are the last scores of Tarasov et al. (NeurIPS 2023).
+    "wPC, paper": "19.6 19.9 0.7 53.3 86.5 86.0 48.3 97.0 89.9 93.7 95.7 110.1",
+    "TD3+BC, paper": "11.7 8.6 0.9 48.2 57.7 83.2 44.6 67.4 83.7 90.7 106.1 110.1",
+    "TD3+BC, CORL": "- - - 48.1 60.4 82.7 44.8 64.4 85.6 90.8 101.2 110.0",
+    "wBC, paper": "2.2 10.5 12.1 45.6 64.2 81.0 41.1 86.6 61.2 92.5 105.8 109.9",
+    "BC, paper": "2.3 4.8 1.7 42.6 52.9 75.3 36.6 18.1 26.0 55.2 52.5 107.5",
+    "BC, CORL": "- - - 42.4 53.5 63.2 35.7 29.8 21.8 56.0 52.3 99.0",
+    "wPC-e, paper": "16.0 9.1 4.4 48.6 67.0 83.8 44.6 88.9 85.6 91.5 103.0 110.2",
+    "wPC-rnd, paper": "15.5 7.9 0.2 50.5 66.5 59.3 47.0 78.5 77.1 75.0 59.6 103.1",
 }
-EXPERIMENTS = {  # systems and tasks
-    "table1": (["wpc", "td3_bc", "wbc"], TASKS),
-    "table2": (["wpc", "td3_bc", "wpc-exponential", "wpc-random"], TASKS),
-    "figure4": (["wpc", "wpc-static"], ["walker2d-medium-v2"]),
+SYSTEMS = {
+    # How each is drawn: colours that the colour-blind can tell apart (Okabe and Ito,
+    # 2008), and line styles for print
+    "wPC": ("#0072B2", "-"),
+    "TD3+BC": ("#E69F00", "--"),
+    "wBC": ("#009E73", "-."),
+    "BC": ("#000000", ":"),
+    "wPC-e": ("#CC79A7", (0, (6, 1, 1, 1, 1, 1))),
+    "wPC-rnd": ("#56B4E9", ":"),
+    "static weight": ("#D55E00", (0, (8, 2))),
 }
-FIGURES = {  # of the paper, and what each shows of an experiment
-    "table1": {"figure2.png": ["normalized_score"], "figure3.png": ["q"]},
-    "table2": {"figure5.png": ["normalized_score"]},
-    "figure4": {"figure4.png": ["q", "normalized_score"]},
-}
-STYLES = {
-    # How each system is called and drawn: colours that the colour-blind can tell apart
-    # (Okabe and Ito, 2008), and line styles for print.
-    "wpc": ("wPC", "#0072B2", "-"),
-    "td3_bc": ("TD3+BC", "#E69F00", "--"),
-    "wbc": ("wBC", "#009E73", "-."),
-    "wpc-exponential": ("wPC-e", "#CC79A7", (0, (6, 1, 1, 1, 1, 1))),
-    "wpc-random": ("wPC-rnd", "#56B4E9", ":"),
-    "wpc-static": ("static weight", "#D55E00", (0, (8, 2))),
+COMPARED = ["wPC", "TD3+BC", "wBC"]
+OF_WEIGHTS = {"exponential": "wPC-e", "random": "wPC-rnd", "static": "static weight"}
+NOT_COMPARED = "env dataset seed max_timesteps eval_freq eval_episodes device run_dir"
+EXPERIMENTS = {  # the scripts with what tells their runs apart, and the tasks
+    "table1": ("wpc td3_bc wbc", TASKS),
+    "table2": ("wpc td3_bc wpc--weight=exponential wpc--weight=random", TASKS),
+    "figure4": ("wpc wpc--weight=static", ["walker2d-medium"]),
+    "runaway": (
+        "wpc wpc--alpha=1.0 wpc--alpha=0.5 wpc--alpha=0.1",
+        ["walker2d-medium", "walker2d-medium-200000", "walker2d-medium-50000"],
+    ),
 }
 
 
-@dataclass
-class List:
-    """Print the commands of an experiment, one a line."""
+def list_commands(
+    experiment: tyro.conf.Positional[Literal["table1", "table2", "figure4", "runaway"]],
+    runs: Path = Path("runs"),
+    datasets: Path | None = None,
+    seeds: int = 5,
+    compiled: bool = False,
+):
+    """Print the commands of an experiment, one a line.
 
-    experiment: Annotated[Literal["table1", "table2", "figure4"], tyro.conf.Positional]
-    systems: list[str] = field(default_factory=list)
-    """only these: wpc, td3_bc, wbc, wpc-exponential, wpc-random, wpc-static"""
-    tasks: list[str] = field(default_factory=list)
-    """only these, or others than the experiment's"""
-    seeds: list[int] = field(default_factory=lambda: [0, 1, 2, 3, 4])
-    """seeds of the runs"""
-    max_timesteps: int = 1_000_000
-    """training steps of a run"""
-    runs: Path = Path("runs")
-    """folder of the run folders, <system>__<task>__<seed>"""
-    datasets: Path | None = None
-    """folder with files such as halfcheetah_medium.hdf5, to be used for D4RL's"""
-    extra: str = ""
-    """further arguments of every command, such as --extra="--eval-freq 10000" """
-
-
-@dataclass
-class Report:
-    """Write tables.md and figures from the run folders."""
-
-    runs: Path = Path("runs")
-    """folder of the run folders"""
-    out: Path = Path("report")
-    """folder to write to"""
-    tasks: list[str] = field(default_factory=list)
-    """only these"""
-
-
-def list_commands(args):
-    systems, tasks = EXPERIMENTS[args.experiment]
-    unknown = set(args.systems) - set(STYLES)
-    if unknown:
-        names = ", ".join(sorted(unknown))
-        sys.exit(f"unknown systems {names}, choose from {', '.join(STYLES)}")
-    for task in args.tasks or tasks:
-        for system in args.systems or systems:
-            for seed in args.seeds:
-                print(command(args, system, task, seed))
-
-
-def command(args, system, task, seed):
-    script, _, weight = system.partition("-")
-    line = [sys.executable, f"{script}.py", "--env", task, "--seed", str(seed)]
-    line += ["--max-timesteps", str(args.max_timesteps)]
-    if args.datasets:
-        name = task.removesuffix("-v2").replace("-", "_")
-        line += ["--dataset", f"{args.datasets}/{name}.hdf5"]
-    if weight:
-        line += ["--weight", weight]
-    line += [
-        *shlex.split(args.extra),
-        "--run-dir",
-        f"{args.runs}/{system}__{task}__{seed}",
-    ]
-    return f"OMP_NUM_THREADS=1 {shlex.join(line)}"
-
-
-def script_versions(run_dir):
-    """The SHA-256 of each version of the script that a run was started with."""
-    path = run_dir / "provenance.jsonl"
-    if not path.exists():
-        return {"unknown"}
-    lines = path.read_text().splitlines()
-    return {json.loads(line)["script_sha256"] for line in lines}
-
-
-def read_runs(folder):
-    """The columns of the run folders' evaluations.csv, arrays over evaluations, as
-    {(system, task): {seed: {column: array}}}, the versions of the script that made them
-    as {(system, task): {SHA-256}}, and what to call each task."""
-    runs, versions, names = {}, {}, {}
-    for path in sorted(folder.glob("*__*__*/evaluations.csv")):
-        system, task, seed = path.parent.name.split("__")
-        rows = list(csv.DictReader(path.open()))
-        if not rows:
-            print(f"{path.parent} has no evaluation yet and is left out")
+    Args:
+        experiment: a table or figure of the paper, or "When does Q run away?"
+        runs: folder of the run folders
+        datasets: folder with files such as halfcheetah_medium.hdf5, used for D4RL's;
+            for runaway also walker2d_medium_200000.hdf5, walker2d_medium_50000.hdf5
+        seeds: number of seeds
+        compiled: run the scripts by tests/tools/compiled.py
+    """
+    systems, tasks = EXPERIMENTS[experiment]
+    for task, system, seed in itertools.product(tasks, systems.split(), range(seeds)):
+        env = re.sub(r"-\d+$", "", task)  # a part of its dataset is no task of D4RL's
+        if env != task and not datasets:
             continue
-        columns = {
-            key: np.array([float(row[key] or "nan") for row in rows])
-            for key in ("step", "normalized_score", "q")
-        }
-        runs.setdefault((system, task), {})[int(seed)] = columns
-        versions.setdefault((system, task), set()).update(script_versions(path.parent))
-        own_dataset = json.loads((path.parent / "args.json").read_text())["dataset"]
-        short = task.removesuffix("-v2")
-        names[task] = f"{short} (not D4RL's file)" if own_dataset else task
-    return runs, versions, names
+        script, *option = system.split("--")
+        line = ["python", *["tests/tools/compiled.py"] * compiled, f"{script}.py"]
+        line += ["--env", f"{env}-v2", "--seed", str(seed)]
+        if datasets:
+            line += ["--dataset", f"{datasets}/{task.replace('-', '_')}.hdf5"]
+        line += ["--max-timesteps", "1000000", "--eval-freq", "10000"]
+        line += [f"--{x}" for x in option]
+        name = f"{task}__{re.sub('[-=]+', '-', system)}__{seed}"
+        print(shlex.join([*line, "--run-dir", f"{runs}/{name}"]))
 
 
-def final_scores(runs, system, task):
-    """The mean of the last ten evaluations of each seed, an array (seeds,)."""
-    seeds = runs.get((system, task), {}).values()
-    return np.array([columns["normalized_score"][-10:].mean() for columns in seeds])
+# --- The runs -------------------------------------------------------------------------
 
 
-def mean_and_std(scores):
-    if len(scores) == 0:
-        return "missing"
-    if len(scores) == 1:
-        return f"{scores[0]:.1f} (1)"
-    return f"{scores.mean():.1f} ± {scores.std(ddof=1):.1f} ({len(scores)})"
+@dataclass(eq=False)
+class Group:
+    """The runs of a system on a task, one a seed, at the steps that all of them have:
+    arrays (seeds, evaluations), and `steps` (evaluations,)."""
+
+    task: str
+    system: str
+    others: str  # arguments that are not the system's own, such as "alpha 1.0"
+    alpha: float | None
+    best_return: float
+    steps: np.ndarray
+    scores: np.ndarray
+    q: np.ndarray
+
+    def last_ten(self, steps=None):
+        """Each seed's mean of the last ten scores, at these steps alone: (seeds,)."""
+        among = np.isin(self.steps, self.steps if steps is None else steps)
+        return self.scores[:, among][:, -10:].mean(axis=1)
+
+    @property
+    def size(self):
+        return f"{len(self.scores)}; {self.steps[-1] / 1000:,g}k"
 
 
-def difference(scores, others):
-    """The difference of two means and its standard error, bold where it is more than
-    two of them."""
-    if min(len(scores), len(others)) < 2:
+def read_run(folder):
+    """What the report needs of a run; a ValueError says why it is of no use."""
+    args = json.loads((folder / "args.json").read_text())
+    rows = list(csv.DictReader((folder / "evaluations.csv").open()))
+    rows = [row for row in rows if float(row["step"])]  # at 0, nothing is trained yet
+    if len(rows) < 10:
+        raise ValueError(f"{len(rows)} evaluations, ten are needed")
+    if any(None in row or None in row.values() for row in rows):
+        raise ValueError("evaluations.csv has a row that is too short or too long")
+    score = "normalized_score" if "normalized_score" in rows[0] else "mean_return"
+    run = {
+        name: np.array([float(row.get(name) or "nan") for row in rows])
+        for name in ("step", score, "q", "best_return")
+    }
+    run["score"] = run.pop(score)
+    if not np.isfinite(run["score"]).all() or not (np.diff(run["step"]) > 0).all():
+        raise ValueError("evaluations.csv lacks scores, or its steps do not increase")
+
+    task = Path(args["dataset"] or args["env"]).stem.replace("_", "-")
+    task = task.removesuffix("-v2") + " (mean return)" * (score == "mean_return")
+    if "weight" in args:
+        script, system = "wpc", OF_WEIGHTS.get(args["weight"], "wPC")
+    elif "alpha" in args:
+        script, system = "td3_bc", "TD3+BC" if args["alpha"] else "BC"
+    else:
+        script, system = "wbc", "wBC"
+    defaults = vars(importlib.import_module(script).Args(env=task, dataset="-"))
+    if system == "BC":
+        defaults["alpha"] = 0
+    if system in OF_WEIGHTS.values():
+        defaults["weight"] = args["weight"]
+    others = ", ".join(
+        f"{name} {args[name]}"
+        for name, default in defaults.items()
+        if args.get(name, default) != default and name not in NOT_COMPARED.split()
+    )
+    run |= {"key": (task, system, others), "folder": folder}
+    return run | {"seed": args["seed"], "alpha": args.get("alpha")}
+
+
+def read_groups(folder):
+    """The groups of runs by (task, system, other arguments), in the paper's order.
+    Says on stdout what does not count, and why."""
+    runs, groups = {}, {}
+    for path in sorted(folder.rglob("evaluations.csv")):
+        try:
+            run = read_run(path.parent)
+        except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+            print(f"passed over: {path.parent} ({type(error).__name__}: {error})")
+            continue
+        seeds = runs.setdefault(run["key"], {})
+        pair = [seeds.get(run["seed"], run), run]
+        short, long = sorted(pair, key=lambda run: run["step"][-1])
+        seeds[run["seed"]] = long
+        if short is not long:
+            print(f"passed over: {short['folder']} ({long['folder']} is of its seed)")
+
+    def in_order(key):
+        task, system, others = key
+        place = TASKS.index(task) if task in TASKS else len(TASKS)
+        return place, task, list(SYSTEMS).index(system), others
+
+    for key in sorted(runs, key=in_order):
+        seeds = [runs[key][seed] for seed in sorted(runs[key])]
+        steps = sorted(set.intersection(*(set(run["step"]) for run in seeds)))
+        longest = max(run["step"][-1] for run in seeds)
+        if len(steps) < 10:
+            print(f"passed over: {key} (its runs share {len(steps)} evaluations)")
+            continue
+        if longest > steps[-1]:
+            print(f"{key} counts to step {steps[-1]:,.0f}, not to {longest:,.0f}")
+        scores, q = (
+            np.stack([run[name][np.isin(run["step"], steps)] for run in seeds])
+            for name in ("score", "q")
+        )
+        alpha, best_return = seeds[0]["alpha"], seeds[0]["best_return"][-1]
+        groups[key] = Group(*key, alpha, best_return, np.array(steps), scores, q)
+    return groups
+
+
+# --- The tables -----------------------------------------------------------------------
+
+
+def markdown(header, rows):
+    lines = [header, ["---"] * len(header), *rows]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines) if rows else ""
+
+
+def mean_and_std(values):
+    std = f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else ""
+    return f"{values.mean():.1f}{std}"
+
+
+def published(source, task):
+    """A score such as the one of "wPC, paper"; "-" if there is none."""
+    scores = PUBLISHED.get(source, "").split()
+    return scores[TASKS.index(task)] if scores and task in TASKS else "-"
+
+
+def score_table(groups, tasks, systems):
+    """Our scores, and beside them those that were published."""
+    path = ROOT / "tests/results/datasets.csv"
+    data = list(csv.DictReader(path.open())) if path.exists() else []
+    data = {row["task"]: f"{float(row['mean_score']):.1f}" for row in data}
+    header, rows = ["task", "the data"], [[task, data.get(task, "-")] for task in tasks]
+    for system in systems:
+        sources = [source for source in PUBLISHED if source.startswith(f"{system},")]
+        header += [system, *sources]
+        for row in rows:
+            group = groups.get((row[0], system, ""))
+            ours = f"{mean_and_std(group.last_ten())} ({group.size})" if group else "-"
+            row += [ours, *(published(source, row[0]) for source in sources)]
+    return markdown(header, rows)
+
+
+def difference(group, other):
+    """The difference of two groups' means, its 95% interval and p by Welch's t test."""
+    if not group or not other or min(len(group.scores), len(other.scores)) < 2:
         return "-"
-    mean = scores.mean() - others.mean()
-    error = np.hypot(stats.sem(scores), stats.sem(others))
-    text = f"{mean:.1f} ± {error:.1f}"
-    return f"**{text}**" if abs(mean) > 2 * error else text
+    steps = np.intersect1d(group.steps, other.steps)
+    if len(steps) < 10:
+        return "-"
+    ours, theirs = group.last_ten(steps), other.last_ten(steps)
+    test = stats.ttest_ind(ours, theirs, equal_var=False)
+    low, high = test.confidence_interval()
+    text = f"{ours.mean() - theirs.mean():.1f} [{low:.1f}, {high:.1f}]"
+    size = f"{len(ours)}, {len(theirs)}; {steps[-1] / 1000:,g}k"
+    return f"{text}, p = {test.pvalue:.2g} ({size})"
+
+
+def difference_table(groups, tasks, systems):
+    first, *others = systems
+    rows = []
+    for task in tasks:
+        group, *rest = (groups.get((task, system, "")) for system in systems)
+        rows.append([task, *(difference(group, other) for other in rest)])
+    rows = [row for row in rows if set(row[1:]) != {"-"}]
+    return markdown(["task", *(f"{first} - {other}" for other in others)], rows)
 
 
 def interquartile_mean(*tasks, axis=-1):
     return stats.trim_mean(np.concatenate(tasks, axis=axis), 0.25, axis=axis)
 
 
-def interquartile_mean_and_interval(tasks):
-    """The interquartile mean of all scores of some tasks, arrays (seeds,), and its 95%
-    interval by the stratified bootstrap (Agarwal et al., NeurIPS 2021): the seeds of
-    each task are drawn anew."""
-    low, high = stats.bootstrap(
-        tasks, interquartile_mean, method="percentile", n_resamples=20_000, rng=0
-    ).confidence_interval
-    return f"{interquartile_mean(*tasks):.1f} [{low:.1f}, {high:.1f}]"
+def interquartile_table(groups, systems):
+    """A row for each set of tasks on which all systems have as many seeds and steps,
+    with a 95% interval by the stratified bootstrap (Agarwal et al., NeurIPS 2021)."""
+    alike, rows = {}, []
+    for task in TASKS:
+        of_task = [groups[task, s, ""] for s in systems if (task, s, "") in groups]
+        sizes = {group.size for group in of_task}
+        if len(of_task) == len(systems) and len(sizes) == 1 and len(of_task[0].q) > 1:
+            alike.setdefault(sizes.pop(), []).append(of_task)
+    for size, of_tasks in alike.items():
+        row = [f"{', '.join(of_task[0].task for of_task in of_tasks)} ({size})"]
+        for of_system in zip(*of_tasks, strict=True):
+            x = [group.last_ten() for group in of_system]
+            options = {"method": "percentile", "n_resamples": 20_000, "rng": 0}
+            test = stats.bootstrap(x, interquartile_mean, **options)
+            low, high = test.confidence_interval
+            row.append(f"{interquartile_mean(*x):.1f} [{low:.1f}, {high:.1f}]")
+        if len(of_tasks) > 1:
+            rows.append(row)
+    return markdown(["tasks", *systems], rows)
 
 
-def paper_value(system, task):
-    if system not in PAPER or task not in TASKS:
-        return "-"
-    return PAPER[system].split()[TASKS.index(task)]
+def span(values, form):
+    low, high = format(min(values), form), format(max(values), form)
+    return low if low == high else f"{low} to {high}"
 
 
-def markdown(header, rows):
-    lines = [header, ["---"] * len(header), *rows]
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
-
-
-def steps_of(runs, systems, task):
-    """How long the runs of a task are, such as "10,000" or "10,000 to 20,000" steps."""
-    last_steps = {
-        int(columns["step"][-1])
-        for system in systems
-        for columns in runs.get((system, task), {}).values()
-    }
-    ends = sorted({min(last_steps), max(last_steps)})
-    return " to ".join(f"{step:,}" for step in ends)
-
-
-def tables(runs, names, systems, tasks):
-    """Three tables in Markdown: our scores, the differences between the first system
-    and the others, and the paper's scores."""
-    labels = [STYLES[system][0] for system in systems]
-    ours, differences, papers = [], [], []
-    of_complete_tasks = []
-    for task in tasks:
-        scores = [final_scores(runs, system, task) for system in systems]
-        steps = steps_of(runs, systems, task)
-        ours.append([names[task], steps, *map(mean_and_std, scores)])
-        first, *others = scores
-        differences.append([names[task], *(difference(first, x) for x in others)])
-        papers.append([task, *(paper_value(system, task) for system in systems)])
-        if min(map(len, scores)) >= 3:
-            of_complete_tasks.append(scores)
-    if len(of_complete_tasks) > 1:
-        by_system = zip(*of_complete_tasks, strict=True)
-        cells = [interquartile_mean_and_interval(scores) for scores in by_system]
-        title = f"interquartile mean of {len(of_complete_tasks)} tasks"
-        ours.append([title, "", *cells])
-    minus = [f"{labels[0]} - {label}" for label in labels[1:]]
-    return [
-        markdown(["task", "steps", *labels], ours),
-        markdown(["task", *minus], differences),
-        markdown(["the paper's", *labels], papers),
-    ]
-
-
-def versions_table(versions):
-    """A Markdown table: the version of the script that each system's runs are of."""
-    tasks = {}
-    for (system, task), scripts in versions.items():
-        for script in scripts:
-            tasks.setdefault((system, script), []).append(task)
-    rows = [
-        [STYLES[system][0], script[:16], ", ".join(of_script)]
-        for (system, script), of_script in sorted(tasks.items())
-    ]
-    return markdown(["system", "SHA-256 of its script", "tasks"], rows)
-
-
-def draw_panel(axis, runs, systems, task, column):
-    """The mean over seeds of a column, with a standard deviation on each side; where Q
-    runs away, its median and range. Dotted: the score that the paper ends with."""
-    labels = {
-        "normalized_score": "normalized score",
-        "q": "Q(s, a), mean over a batch",
-    }
-    axis.set_ylabel(labels[column])
-    for system in systems:
-        seeds = list(runs.get((system, task), {}).values())
-        if not seeds:
+def q_table(groups):
+    """Q over the data's best discounted return."""
+    header = "task, system, arguments, seeds; steps, Q at the end, largest Q, at step"
+    header = [*header.split(", "), "seeds over 1", "back", "score"]
+    rows = []
+    for group in groups.values():
+        if not group.best_return > 0:
             continue
-        label, color, line = STYLES[system]
-        length = min(len(columns["step"]) for columns in seeds)
-        steps = seeds[0]["step"][:length] / 1000
-        values = np.stack([columns[column][:length] for columns in seeds])
-        mean = values.mean(axis=0)
-        std = values.std(axis=0, ddof=1) if len(seeds) > 1 else 0
-        middle, low, high = mean, mean - std, mean + std
-        if column == "q" and values.max() > 10_000:  # Q runs away: seeds are far apart
-            axis.set_yscale("log")
-            middle, low, high = np.percentile(values, [50, 0, 100], axis=0)
-        label = f"{label} ({len(seeds)})"
-        axis.plot(steps, middle, linestyle=line, color=color, label=label)
-        axis.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
-        paper = paper_value(system, task)
-        if column == "normalized_score" and paper != "-":
-            axis.axhline(float(paper), linestyle=":", color=color, linewidth=1)
-            axis.set_ylabel("normalized score (dotted: the paper's)")
-    axis.set_xlabel("training steps (thousands)")
-    axis.grid(alpha=0.3)
+        ratio = group.q / group.best_return
+        end, largest = ratio[:, -10:].mean(axis=1), ratio.max(axis=1)
+        over = largest > 1
+        arguments = group.others or (f"alpha {group.alpha}" if group.alpha else "")
+        row = [group.task, group.system, arguments, group.size, span(end, ".2f")]
+        row += [span(largest, ".2f"), span(group.steps[ratio.argmax(axis=1)], ",.0f")]
+        row += [str(over.sum()), str((over & (end < 1)).sum())]
+        rows.append([*row, mean_and_std(group.last_ten())])
+    return markdown(header, rows)
 
 
-def draw_figure(path, runs, names, systems, tasks, columns):
-    """A panel for each task and column; nothing if no task has two of the systems."""
-    tasks = [t for t in tasks if sum((s, t) in runs for s in systems) > 1]
-    panels = [(task, column) for task in tasks for column in columns]
-    if not panels:
-        return
+def reproduction_table(pairs):
+    """TD3+BC's mean score over all evaluations, on our data and on D4RL's files."""
+    rows = []
+    for group, curve in pairs:
+        _, i, j = np.intersect1d(group.steps, curve["step"], return_indices=True)
+        ours = group.scores[:, i].mean(axis=1)
+        theirs, std, p = curve["mean"][j].mean(), curve["average_std"][j[-1]], "-"
+        if len(ours) > 1:
+            both = ours.mean(), ours.std(ddof=1), len(ours), theirs, std, 5
+            p = f"{stats.ttest_ind_from_stats(*both, equal_var=False).pvalue:.2g}"
+        row = [group.task, f"{mean_and_std(ours)} ({group.size})"]
+        rows.append([*row, f"{theirs:.1f} ± {std:.1f} (5)", p])
+    return markdown(["task", "ours", "on D4RL's files", "p"], rows)
+
+
+# --- The figures ----------------------------------------------------------------------
+
+
+def band(values):
+    """The lowest, mean and highest of some seeds' values (seeds, evaluations)."""
+    return values.min(axis=0), values.mean(axis=0), values.max(axis=0)
+
+
+def panel(groups, task, systems, column):
+    """A task's scores with the paper's dotted, or its Q with the best return dashed."""
+    shown = [groups[task, s, ""] for s in systems if (task, s, "") in groups]
+    curves = [
+        (group.system, SYSTEMS[group.system], group.steps, band(getattr(group, column)))
+        for group in shown
+    ]
+    if column == "q":
+        levels = [(shown[0].best_return, "black", "--")]
+        return task, "Q (dashed: best return)", curves, levels
+    papers = [(published(f"{x.system}, paper", task), x.system) for x in shown]
+    levels = [(float(score), SYSTEMS[s][0], ":") for score, s in papers if score != "-"]
+    return task, "score (dotted: the paper's)", curves, levels
+
+
+def runaway_panels(groups):
+    """Q and scores of wPC with several alphas, or on parts of a dataset."""
+    families = {}
+    for group in groups.values():
+        if group.system == "wPC" and re.fullmatch(r"(alpha \S+)?", group.others):
+            family = re.sub(r"-\d+k?$", "", group.task)
+            families.setdefault(family, []).append(group)
+    shown = itertools.chain(*(x for x in families.values() if len(x) > 1))
+    shown = sorted(shown, key=lambda group: -group.alpha)
+    alphas = dict.fromkeys(group.alpha for group in shown)
+    styles = dict(zip(alphas, itertools.cycle(SYSTEMS.values()), strict=False))
+    q_panels, score_panels = {}, {}
+    for group in shown:
+        curve = f"alpha {group.alpha}", styles[group.alpha], group.steps
+        task, ratio = group.task, group.q / group.best_return
+        empty = task, "Q / best return in the data", [], [(1, "black", "--")]
+        q_panels.setdefault(task, empty)[2].append((*curve, band(ratio)))
+        empty = task, "score", [], []
+        score_panels.setdefault(task, empty)[2].append((*curve, band(group.scores)))
+    return [*q_panels.values(), *score_panels.values()]
+
+
+def reproduction_panel(group, curve):
+    theirs = curve["step"], [curve[name] for name in ("min", "mean", "max")]
+    curves = [("on D4RL's own files (five seeds)", ("#555555", "-"), *theirs)]
+    ours = ("TD3+BC on our data", SYSTEMS["TD3+BC"], group.steps, band(group.scores))
+    return group.task, "score", [*curves, ours], []
+
+
+def draw(path, panels):
+    """A figure of panels (title, label of the y axis, curves, horizontal lines)."""
     height = math.ceil(len(panels) / 3)
     width = math.ceil(len(panels) / height)
+    size = 3.6 * width, 2.9 * height + 0.6
     figure, axes = plt.subplots(
-        height,
-        width,
-        figsize=(4.4 * width, 4.0 * height),
-        squeeze=False,
-        layout="constrained",
+        height, width, figsize=size, squeeze=False, layout="constrained"
     )
-    for axis, (task, column) in zip(axes.flat, panels, strict=False):
-        draw_panel(axis, runs, systems, task, column)
-        axis.set_title(names[task], fontsize="medium")
-        axis.legend(
-            title="system (seeds)",
-            fontsize="small",
-            title_fontsize="small",
-            frameon=False,
-            ncols=3,
-            loc="upper center",
-            bbox_to_anchor=(0.5, -0.18),  # below the panel: over no curve
-        )
+    handles = {}
+    for axis, (title, ylabel, curves, levels) in zip(axes.flat, panels, strict=False):
+        for label, (color, line), steps, (low, middle, high) in curves:
+            (handle,) = axis.plot(steps / 1000, middle, linestyle=line, color=color)
+            axis.fill_between(steps / 1000, low, high, color=color, alpha=0.2, lw=0)
+            handles.setdefault(label, handle)
+            if ylabel.startswith("Q") and high.max() > 10 * levels[0][0]:
+                axis.set_yscale("log")
+        for level, color, line in levels:
+            axis.axhline(level, color=color, linestyle=line, linewidth=1)
+        axis.set(title=title, xlabel="training steps (thousands)", ylabel=ylabel)
+        axis.grid(alpha=0.3)
     for axis in axes.flat[len(panels) :]:
         axis.remove()
+    figure.legend(
+        handles.values(),
+        handles,
+        title="mean over seeds, and their range",
+        loc="outside lower center",
+        ncols=len(handles) if width > 1 else 1,
+        frameon=False,
+    )
     figure.savefig(path, dpi=130)
     plt.close(figure)
+    print(f"wrote {path}")
 
 
-def shown_tasks(runs, systems, tasks):
-    """The tasks of an experiment: those with a run of one of its systems or, where it
-    compares weights, of one of the other weights."""
-    weights = [system for system in systems if system.startswith("wpc-")]
-    return [t for t in tasks if any((s, t) in runs for s in weights or systems)]
+# --- The report -----------------------------------------------------------------------
+
+INTRODUCTION = """\
+Scores are D4RL's normalized ones, or returns where a task is called "(mean return)". A
+score is the mean of a run's last ten evaluations; over seeds: mean ± sample standard
+deviation (seeds; training steps). What the paper and CORL have published is of D4RL's
+own files. "The data" is the mean score of the episodes trained on. Runs whose arguments
+differ from the scripts' defaults are in the table on Q alone.
+"""
+NOTES = {
+    "Differences": "Mean, 95% interval and p of Welch's t test, not corrected for "
+    "the number of tests (seeds of each; steps).",
+    "Interquartile means": "Over all runs of the tasks on which the systems have as "
+    "many seeds and steps; 95% interval by a bootstrap over the seeds of each task.",
+    "When does Q run away?": "Q (its mean over a batch) divided by the best discounted "
+    "return from any row of the data on, from the lowest to the highest seed: the mean "
+    "of the last ten evaluations, the largest and its step; how many seeds had it over "
+    "1, and with how many of these it came back below.",
+    "TD3+BC on our data and on D4RL's": "Mean score of all evaluations to this step, "
+    "and Welch's p. The published curves are tests/results/td3_bc_on_d4rl.csv.",
+}
 
 
-def report(args):
-    runs, versions, names = read_runs(args.runs)
-    if args.tasks:
-        names = {task: name for task, name in names.items() if task in args.tasks}
-    if not names:
-        sys.exit(
-            f"{args.runs} holds no run folders <system>__<task>__<seed> with "
-            "evaluations: run what `list` prints"
-        )
-    versions = {key: scripts for key, scripts in versions.items() if key[1] in names}
-    args.out.mkdir(parents=True, exist_ok=True)
-    known = [task for task in TASKS if task in names]
-    tasks = known + sorted(names.keys() - set(TASKS))
-    text = [
-        "Normalized scores on our data: the mean of the last ten evaluations, mean ± "
-        "sample standard deviation over seeds (their number). The interquartile mean "
-        "is over the runs of all tasks with three seeds of each system; in brackets, "
-        "its 95% interval by a bootstrap that is stratified by task. Differences: ± "
-        "their standard error, bold where they are more than two of these. The paper's "
-        "scores are from D4RL's files, 1,000,000 steps and five seeds.\n",
-    ]
-    for experiment, (systems, _) in EXPERIMENTS.items():
-        shown = shown_tasks(runs, systems, tasks)
-        if not shown:
-            continue
-        heading = experiment.replace("e", "e ", 1).capitalize()
-        text += [f"## {heading}\n", *tables(runs, names, systems, shown)]
-        for figure, columns in FIGURES[experiment].items():
-            draw_figure(args.out / figure, runs, names, systems, shown, columns)
-    text += ["## Scripts\n", versions_table(versions)]
-    for (system, task), scripts in versions.items():
-        if len(scripts) > 1:
-            text.append(
-                f"{STYLES[system][0]} on {names[task]}: its runs are of {len(scripts)} "
-                "different versions of the script.\n"
-            )
-    (args.out / "tables.md").write_text("\n".join(text))
-    print("\n".join(text) + f"\nwritten to {args.out}/")
+def report(runs: Path = Path("runs"), out: Path = Path("report")):
+    """Write tables.md and figures from the run folders.
+
+    Args:
+        runs: folder to search for run folders
+        out: folder to write to
+    """
+    groups = read_groups(runs)
+    if not groups:
+        sys.exit(f"{runs} holds no run with ten evaluations: run what `list` prints")
+    out.mkdir(parents=True, exist_ok=True)
+
+    def tasks_of(*systems, at_least=1):
+        tasks = dict.fromkeys(task for task, _, _ in groups)
+        count = {t: sum((t, s, "") in groups for s in systems) for t in tasks}
+        return [task for task in tasks if count[task] >= at_least]
+
+    path = ROOT / "tests/results/td3_bc_on_d4rl.csv"
+    options = {"delimiter": ",", "dtype": None, "encoding": "utf-8"}
+    on_d4rl = np.genfromtxt(path, names=True, skip_header=4, **options)
+    pairs = []
+    for task in tasks_of("TD3+BC"):
+        group, curve = groups[task, "TD3+BC", ""], on_d4rl[on_d4rl["task"] == task]
+        if np.isin(group.steps, curve["step"]).any():
+            pairs.append((group, curve))
+
+    table_1, weights = [*COMPARED, "BC"], ["wPC", "TD3+BC", *OF_WEIGHTS.values()]
+    others = tasks_of(*OF_WEIGHTS.values())
+    tables = {
+        "Table 1": score_table(groups, tasks_of(*table_1), table_1),
+        "Differences": difference_table(groups, tasks_of(*COMPARED), COMPARED),
+        "Interquartile means": interquartile_table(groups, COMPARED),
+        "Other weights (Table 2, Figure 4)": score_table(groups, others, weights),
+        "Differences to other weights": difference_table(groups, others, weights),
+        "When does Q run away?": q_table(groups),
+        "TD3+BC on our data and on D4RL's": reproduction_table(pairs),
+    }
+    text = INTRODUCTION
+    for title, table in tables.items():
+        if table:
+            note = f"{NOTES[title]}\n\n" if title in NOTES else ""
+            text += f"\n## {title}\n\n{note}{table}"
+    (out / "tables.md").write_text(text)
+    print(f"{text}\nwrote {out / 'tables.md'}")
+
+    compared, static = tasks_of(*COMPARED, at_least=2), tasks_of("static weight")
+    figure4 = itertools.product(static, ("q", "scores"))
+    figure5 = tasks_of("wPC-e", "wPC-rnd")
+    figures = {
+        "figure2": [panel(groups, task, COMPARED, "scores") for task in compared],
+        "figure3": [panel(groups, task, COMPARED, "q") for task in compared],
+        "figure4": [panel(groups, t, ["wPC", "static weight"], x) for t, x in figure4],
+        "figure5": [panel(groups, task, weights[:4], "scores") for task in figure5],
+        "runaway": runaway_panels(groups),
+        "reproduction": [reproduction_panel(*pair) for pair in pairs],
+    }
+    for name, panels in figures.items():
+        if panels:
+            draw(out / f"{name}.png", panels)
+
+
+def main(arguments=None):
+    commands = {"list": list_commands, "report": report}
+    tyro.extras.subcommand_cli_from_dict(commands, description=__doc__, args=arguments)
 
 
 if __name__ == "__main__":
-    commands = {"list": List, "report": Report}
-    args = tyro.extras.subcommand_cli_from_dict(commands, description=__doc__)
-    list_commands(args) if isinstance(args, List) else report(args)
+    main()
