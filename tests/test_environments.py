@@ -111,7 +111,7 @@ def test_spaces_that_do_not_fit_are_refused(name):
         wpc.make_envs(f"{name}-v0", 2)
     sentence = stop.value.code
     assert sentence.startswith(f"--env {name}-v0 ") and "\n" not in sentence
-    assert "states in a Box of one axis" in sentence
+    assert "one-dimensional Boxes of states" in sentence
 
 
 def test_an_environment_without_a_time_limit_is_refused():

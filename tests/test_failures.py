@@ -26,7 +26,7 @@ from conftest import (
 
 MISTAKES = [
     (["--env", "NoRobot-v4"], "Environment `NoRobot` doesn't exist"),
-    (["--env", "hopper"], "observations must be (90000, 11) finite numbers"),
+    (["--env", "hopper"], "observations must be finite, in shape (90000, 11)"),
     (["--dataset", "nowhere.hdf5"], "nowhere.hdf5 can't be read: "),
 ]
 
@@ -39,26 +39,24 @@ def test_mistakes_get_one_sentence(monkeypatch, tmp_path, arguments, sentence):
 
 
 OUT_OF_BOUNDS = {
-    "steps, frequencies, episodes and batch_size start at 1": [
+    "steps, frequencies, episodes and batch_size must be >= 1": [
         {"max_timesteps": 0},
         {"eval_freq": 0},
         {"eval_episodes": 0},
         {"batch_size": 0},
         {"policy_freq": -1},
     ],
-    "discount and tau must be from 0 to 1": [
+    "discount and tau must be between 0 and 1": [
         {"discount": 1.1},
         {"discount": -0.1},
         {"discount": float("nan")},
         {"tau": 1.5},
         {"tau": -0.5},
     ],
-    "HalfCheetah-v4 is no task of D4RL's: --dataset is missing": [
+    "HalfCheetah-v4 is not a D4RL task: it needs --dataset": [
         {"env": "HalfCheetah-v4"}
     ],
-    "ant-medium-v2 is no task of D4RL's: --dataset is missing": [
-        {"env": "ant-medium-v2"}
-    ],
+    "ant-medium-v2 is not a D4RL task: it needs --dataset": [{"env": "ant-medium-v2"}],
 }
 CASES = [(options, text) for text, cases in OUT_OF_BOUNDS.items() for options in cases]
 
@@ -77,7 +75,7 @@ def test_the_bounds_themselves_are_fine(script):
 def test_a_mistake_ends_the_process_with_that_sentence(tmp_path):
     """tyro puts it into a box."""
     process = run(*command("wpc")[:2], "--env", "ant-medium-v2", cwd=tmp_path)
-    assert "ant-medium-v2 is no task of D4RL's: --dataset" in process.stderr
+    assert "ant-medium-v2 is not a D4RL task: it needs --dataset" in process.stderr
     assert process.returncode == 2 and "Traceback" not in process.stderr
     assert list(tmp_path.iterdir()) == []
 
@@ -192,7 +190,7 @@ def test_ctrl_c_ends_with_the_command_to_continue(monkeypatch, capsys, script):
         run_main(monkeypatch, script, KeyboardInterrupt())
     shown = stop.value.code.removeprefix("stopped; to continue: ")
     assert shown.startswith("python script.py --run-dir runs/hopper-medium-v2__")
-    assert capsys.readouterr().out == f"to continue  {shown}\n"
+    assert capsys.readouterr().out == f"to continue: {shown}\n"
 
 
 # Divergence

@@ -57,7 +57,7 @@ def test_a_run_from_start_to_end(monkeypatch, capfd, tmp_path, name):
     output, errors = capfd.readouterr()
     assert errors == ""
     lines = output.splitlines()
-    assert len(lines) == 5 and lines[0].startswith("to continue  python ")
+    assert len(lines) == 5 and lines[0].startswith("to continue: python ")
     assert "89,910 transitions, with actions up to 1" in lines[1]
     (run_dir,) = Path("runs").iterdir()
     assert run_dir.name.startswith(f"halfcheetah_replay__{name}__0__20")
@@ -225,7 +225,7 @@ def test_stopped_by_ctrl_c_and_continued_with_the_command_shown(finished, tmp_pa
     assert " " in run_dir.name and load(run_dir)["step"] < 60
     assert process.returncode == 1 and errors.count("\n") == 1, errors
     shown = errors.removeprefix("stopped; to continue: ").strip()
-    assert output.startswith(f"to continue  {shown}\n")
+    assert output.startswith(f"to continue: {shown}\n")
 
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     options = {"shell": True, "cwd": tmp_path, "env": environment() | {"PATH": path}}
@@ -281,7 +281,7 @@ def test_output_piped_to_head_loses_nothing(finished, tmp_path):
     """The pipe breaks when the next evaluation is printed; by then it is saved."""
     line = command("wpc", "--run-dir", tmp_path)
     process = run("sh", "-c", f"{shlex.join(line)} | head -1")
-    assert process.stdout.startswith("to continue  python "), process
+    assert process.stdout.startswith("to continue: python "), process
     assert load(tmp_path)["step"] == 30
     time.sleep(1)
     run_here(wpc, *line)
@@ -318,11 +318,11 @@ def test_the_data_may_move(run_dir, tmp_path):
 
 
 CONTRADICTIONS = [
-    ("wpc", ["--seed", 1], "has another seed"),
-    ("wpc", ["--alpha", 1.0], "has another alpha"),
-    ("wpc", ["--batch-size", 32], "has another batch_size"),
-    ("td3_bc", [], "has another "),
-    ("wbc", [], "has another "),
+    ("wpc", ["--seed", 1], "was run with another seed"),
+    ("wpc", ["--alpha", 1.0], "was run with another alpha"),
+    ("wpc", ["--batch-size", 32], "was run with another batch_size"),
+    ("td3_bc", [], "was run with another "),
+    ("wbc", [], "was run with another "),
 ]
 
 

@@ -2,14 +2,18 @@
 """Turns a Minari dataset into an HDF5 file in D4RL's format, which the scripts read.
 
     python tests/tools/from_minari.py mujoco/hopper/medium-v0 --out hopper.hdf5
-    python wpc.py --dataset hopper.hdf5
 
-In Minari, an episode of T steps has T + 1 observations; in D4RL's format it has T, and
-so the last step of an episode that was cut off is lost. Here the last observation gets
-a row of its own, without action and reward, and marked as a timeout. The scripts, like
-D4RL's own reader, then make a transition of each of the T steps, and none of that row.
+The scripts make no transition of a row with a timeout, nor of the last row. So where an
+episode was cut off, its last observation gets a row of its own, without action and
+reward, and marked as a timeout; and no transition of the dataset is lost.
+
+A policy is evaluated on the environment that Minari records for that. Where it has
+arguments, a time limit or wrappers that its id alone does not give, --env must name one
+that has them: register it, as Gymnasium's documentation says, in a module of your own.
 """
 
+import json
+import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +24,12 @@ import h5py
 import minari
 import numpy as np
 import tyro
+from tqdm import tqdm
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from make_dataset import reason, try_to_write
+
+import wpc
 
 
 @dataclass
@@ -28,6 +38,8 @@ class Args:
     """name of a Minari dataset, downloaded on first use, or the folder of one"""
     out: Path
     """HDF5 file to write"""
+    env: str | None = None
+    """Gymnasium id (MODULE:ID) to evaluate on; by default Minari's"""
 
 
 def open_dataset(name):
@@ -40,50 +52,141 @@ def open_dataset(name):
             return minari.MinariDataset(folder)
         return minari.load_dataset(name, download=True)
     except Exception as error:  # from Minari, Hugging Face's client, or the network
-        reason = f"{type(error).__name__}: {error}".split("\n")[0]
-        sys.exit(f"{name} can't be opened or downloaded by Minari ({reason})")
+        sys.exit(f"{name} can't be opened or downloaded by Minari ({reason(error)})")
 
 
 def check_spaces(dataset):
-    for name in ("observation_space", "action_space"):
-        space = getattr(dataset, name)
+    """Exits with a sentence if the scripts can't learn from such data."""
+    if dataset.total_steps == 0:
+        sys.exit(f"{dataset.id} is empty")
+    states, actions = dataset.observation_space, dataset.action_space
+    if not isinstance(actions, gym.spaces.Box):
+        sys.exit(
+            f"{dataset.id} has actions in {actions}, and the policy's are continuous: "
+            "they must be in a Box"
+        )
+    for name, space in {"observations": states, "actions": actions}.items():
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
             sys.exit(
-                f"{dataset.id} has the {name} {space}: it must be a Box of one axis"
+                f"{dataset.id} has {name} in {space}, not in a Box of one axis: make a "
+                "dataset of them flattened (gymnasium.spaces.flatten), and name with "
+                "--env an environment that is flattened likewise"
             )
 
 
-def d4rl_rows(episode):
-    """The T + 1 rows of an episode with T actions, as {key: array}."""
-    no_action = np.zeros_like(episode.actions[:1])
-    return {
-        "observations": episode.observations,
-        "actions": np.concatenate([episode.actions, no_action]),
-        "rewards": np.append(episode.rewards, 0),
-        "terminals": np.append(episode.terminations, False),
-        "timeouts": np.append(np.zeros(len(episode.actions), dtype=bool), True),
+def as_record(spec, states, actions):
+    """What an environment has beside its id, {name: value}."""
+    arguments = {k: v for k, v in spec.kwargs.items() if k != "render_mode"}
+    wrappers = [[x.name, x.kwargs] for x in spec.additional_wrappers or ()]
+    record = {"arguments": arguments, "wrappers": wrappers}
+    record = json.loads(json.dumps(record, default=str))  # as Minari stores them
+    record |= {"time limit": spec.max_episode_steps, "states": states.shape}
+    if isinstance(actions, gym.spaces.Box):
+        return record | {"actions": [actions.low.tolist(), actions.high.tolist()]}
+    return record | {"actions": str(actions)}
+
+
+def choose_env(dataset, env):
+    """The id to evaluate on.
+
+    Exits with a sentence if that is another environment than the one that Minari
+    records, as far as that can be seen.
+    """
+    spec = dataset._eval_env_spec or dataset.env_spec  # the former has no public name
+    if not (env or spec):
+        sys.exit(f"{dataset.id} records no environment: name it with --env")
+    name = env or spec.id
+    try:
+        plain = gym.make(name)
+    except Exception as error:  # the environment's own, or from an import
+        sys.exit(
+            f"{name} can't be made ({reason(error)}): name one with "
+            f"--env, and the module that registers it (MODULE:ID); recorded is {spec}"
+        )
+    theirs = as_record(
+        spec or plain.spec, dataset.observation_space, dataset.action_space
+    )
+    ours = as_record(plain.spec, plain.observation_space, plain.action_space)
+    if spec and env and plain.spec.entry_point != spec.entry_point:
+        # What a class or function of the user's gives is not to be seen from outside.
+        for x in ("arguments", "wrappers"):
+            print(f"{env} is taken to have the {x} of {spec.id}: {theirs.pop(x)}")
+    if env and theirs["time limit"] is None:  # the scripts need one
+        del theirs["time limit"]
+    differences = [
+        f"{x} {value}, not {ours[x]}" for x, value in theirs.items() if value != ours[x]
+    ]
+    if differences:
+        sys.exit(
+            f"{dataset.id} is of another environment than {name}, with "
+            f"{'; '.join(differences)}: register one like it, and name it with --env "
+            "MODULE:ID"
+        )
+    wpc.make_envs(name, 1).close()  # exits if the scripts can't use it
+    return name
+
+
+def d4rl_rows(episode, extra):
+    """The rows of an episode of T steps, {key: array}: T, or with `extra` T + 1."""
+    steps, states = len(episode.actions), np.float32(episode.observations)
+    rows = {
+        "observations": states[:-1],
+        "actions": episode.actions,
+        "rewards": np.float32(episode.rewards),
+        "next_observations": states[1:],
+        "terminals": episode.terminations,
+        "timeouts": np.zeros(steps, dtype=bool),
     }
+    if extra:
+        rows = {k: np.concatenate([x, np.zeros_like(x[:1])]) for k, x in rows.items()}
+        rows["observations"][-1] = rows["next_observations"][-1] = states[-1]
+        rows["timeouts"][-1] = True
+    return rows
 
 
-def main(args: Args):
+def convert(dataset):
+    """The columns of the file, {key: array}."""
+    episodes = []
+    progress = tqdm(total=dataset.total_episodes, disable=None)
+    for episode in dataset.iterate_episodes():
+        progress.update()
+        steps, states = len(episode.actions), len(episode.observations)
+        if states != steps + 1:
+            sys.exit(
+                f"{dataset.id}: episode {episode.id} has {steps} actions and {states} "
+                f"observations, not {steps + 1}; look for a later version of the "
+                "dataset, or make one without this episode"
+            )
+        if steps:
+            episodes.append(episode)
+    # The last row is lost to the scripts. Where there is an episode that was cut off,
+    # that is its extra row, and else the file needs one that belongs to no episode.
+    episodes.sort(key=lambda x: not x.terminations[-1])
+    parts = [
+        d4rl_rows(x, not x.terminations[-1] or x is episodes[-1]) for x in episodes
+    ]
+    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+
+
+def main(args):
+    try_to_write(args.out)
     dataset = open_dataset(args.dataset)
     check_spaces(dataset)
-    episodes = [d4rl_rows(episode) for episode in dataset.iterate_episodes()]
-    attributes = {"source": f"Minari's {dataset.id}"}
-    if dataset.env_spec is not None:
-        attributes["env_id"] = dataset.env_spec.id
-    for name in ("ref_min_score", "ref_max_score"):
-        if dataset.storage.metadata.get(name) is not None:
-            attributes[name] = dataset.storage.metadata[name]
+    env = choose_env(dataset, args.env)
+    columns = convert(dataset)
     with h5py.File(args.out, "w") as file:
-        file.attrs.update(attributes)
-        for key in episodes[0]:
-            column = np.concatenate([rows[key] for rows in episodes])
+        for key, column in columns.items():
             file.create_dataset(key, data=column, compression="gzip", shuffle=True)
     print(
-        f"{args.out}: {dataset.total_steps:,} transitions in {len(episodes):,} episodes"
-        f" of {attributes.get('env_id', 'an environment that Minari does not name')}"
+        f"{args.out}: {dataset.total_steps:,} transitions in "
+        f"{dataset.total_episodes:,} episodes of {env}"
     )
+    metadata = dataset.storage.metadata
+    if metadata.get("ref_max_score") is not None:
+        low, high = metadata["ref_min_score"], metadata["ref_max_score"]
+        print(f"Minari's scores 0 and 100 are returns of {low} and {high}")
+    command = ["python", "wpc.py", "--env", env, "--dataset", str(args.out)]
+    print(f"to train: {shlex.join(command)}")
 
 
 if __name__ == "__main__":

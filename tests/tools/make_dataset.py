@@ -1,26 +1,43 @@
 # SPDX-License-Identifier: MIT
-"""Makes a medium-replay dataset in D4RL's format: all that an online SAC agent
-(Haarnoja et al., 2018) meets, from its first random steps to the policy that it ends
-with. It works for every environment that the scripts can use, and names it in the file.
-The dataset in tests/data/ was made by
+"""Makes a dataset in D4RL's format, of D4RL's robots in D4RL's physics.
 
-    OMP_NUM_THREADS=1 python tests/tools/make_dataset.py --env HalfCheetah-v4 \\
-        --steps 90000 --out tests/data/halfcheetah_replay.hdf5
+With --policy, episodes of a stochastic policy, as in D4RL's medium and expert data, or
+with --random of uniform actions. They are the same for any number of workers.
+
+    python tests/tools/make_dataset.py --env hopper --steps 1000000 \\
+        --policy hopper_medium-v2.hdf5 --out hopper_medium.hdf5
+
+With neither, all that an online SAC agent (Haarnoja et al., 2018) meets, from its first
+random steps to the policy that it ends with, as in D4RL's medium-replay data.
+
+    python tests/tools/make_dataset.py --env hopper --steps 402000 \\
+        --out hopper_medium_replay.hdf5
+
+tests/data/halfcheetah_replay.hdf5 is the beginning of such data: of 202,000 steps, the
+first 1,000 of them random.
 """
 
 import copy
+import functools
+import hashlib
+import itertools
+import multiprocessing
+import os
+import shlex
+import signal
 import sys
+from collections import deque
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import gymnasium as gym
 import h5py
 import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
 import tyro
-from tqdm import trange
+from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import wpc
@@ -28,16 +45,26 @@ import wpc
 
 @dataclass
 class Args:
+    env: str
+    """halfcheetah, hopper or walker2d, or a Gymnasium id"""
+    steps: int
+    """number of transitions in the file"""
     out: Path
     """the HDF5 file to write"""
-    env: str = "HalfCheetah-v4"
-    """Gymnasium environment, or halfcheetah, hopper or walker2d"""
-    steps: int = 90_000
-    """environment steps, which is the number of transitions in the file"""
-    random_steps: int = 5_000
-    """steps of uniformly random actions before the agent acts and learns"""
     seed: int = 0
-    """seed of the environment and of the agent"""
+    """seed of the environment and of the actions"""
+
+    # Episodes of one policy
+    policy: Path | None = None
+    """D4RL file that records its policy, or an .npz of the same names (fc0.weight)"""
+    random: bool = False
+    """take uniform actions"""
+    workers: int = os.cpu_count() or 1
+    """number of processes that collect"""
+
+    # SAC
+    random_steps: int = 5_000
+    """steps of uniform actions before the agent acts and learns"""
     discount: float = 0.99
     """discount factor gamma"""
     tau: float = 0.005
@@ -45,7 +72,115 @@ class Args:
     lr: float = 3e-4
     """learning rate of actor, critics and temperature"""
     batch_size: int = 256
-    """transitions an update"""
+    """number of transitions in a batch"""
+
+    def __post_init__(self):
+        if min(self.steps, self.workers, self.batch_size) < 1:
+            raise ValueError("steps, workers and batch_size must be >= 1")
+        if self.policy and self.random:
+            raise ValueError("--policy and --random exclude each other")
+
+
+# --- Episodes of one policy -----------------------------------------------------------
+
+LAYERS = ("fc0", "fc1", "last_fc", "last_fc_log_std")  # D4RL's names
+
+
+def load_policy(path, state_dim, action_dim):
+    """The (weight, bias) of each of LAYERS, float32 arrays.
+
+    Exits with a sentence if the file has no such policy, or one of another size.
+    """
+    names = [(layer, part) for layer in LAYERS for part in ("weight", "bias")]
+    try:
+        if path.suffix == ".npz":
+            with np.load(path) as file:
+                arrays = [np.float32(file[".".join(name)]) for name in names]
+        else:
+            with h5py.File(path) as file:
+                group = file["metadata/policy"]
+                arrays = [np.float32(group["/".join(name)]) for name in names]
+    except Exception as error:  # of as many types as there are kinds of files
+        sys.exit(f"{path} has no policy as D4RL's files record it ({reason(error)})")
+    widths = arrays[0].shape[1], len(arrays[-1])
+    if widths != (state_dim, action_dim):
+        sys.exit(
+            f"{path} has a policy for {widths[0]} states and {widths[1]} actions, and "
+            f"the environment has {state_dim} and {action_dim}"
+        )
+    return list(zip(arrays[::2], arrays[1::2], strict=True))
+
+
+def distribution(policy, state):
+    """Mean and standard deviation, each (action_dim,), of the action before tanh."""
+    (w0, b0), (w1, b1), (w_mean, b_mean), (w_std, b_std) = policy
+    hidden = np.maximum(w0 @ state + b0, 0)
+    hidden = np.maximum(w1 @ hidden + b1, 0)
+    return w_mean @ hidden + b_mean, np.exp(np.clip(w_std @ hidden + b_std, -20, 2))
+
+
+make_env = functools.cache(lambda env: wpc.make_envs(env, 1).envs[0])
+
+
+def play(env, policy, seed, numbers):
+    """The rows of the episodes of these numbers, and the return of the last.
+
+    Episode k depends on `seed` and k alone. `policy` is None for uniform actions.
+    """
+    env, rows = make_env(env), []
+    low, high = env.action_space.low, env.action_space.high
+    for k in numbers:
+        rng = np.random.default_rng([seed, k])
+        state, _ = env.reset(seed=int(rng.integers(2**31)))
+        over, episode_return = False, 0.0
+        while not over:
+            if policy:
+                mean, std = distribution(policy, np.float32(state))
+                action = high * np.tanh(mean + std * rng.standard_normal(len(std)))
+            else:
+                action = rng.uniform(low, high)
+            action = np.float32(action)
+            next_state, reward, terminal, truncated, _ = env.step(action)
+            timeout = truncated and not terminal
+            rows.append((state, action, reward, next_state, terminal, timeout))
+            state, over = next_state, terminal or truncated
+            episode_return += reward
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    columns = [x.astype("?" if x.dtype == bool else "f4") for x in columns]
+    return columns, episode_return
+
+
+def collect(args, env, data):
+    """Fills `data`; yields how many rows are filled and the last episode's return."""
+    policy = None
+    if args.policy:
+        widths = env.observation_space.shape[0], env.action_space.shape[0]
+        policy = load_policy(args.policy, *widths)
+    # Many processes of one thread each are faster than the other way round.
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    pool = ProcessPoolExecutor(args.workers, multiprocessing.get_context("spawn"))
+    parts, filled = deque(), 0
+    first = itertools.count(step=5)  # five episodes in a task
+    interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)  # not for the workers
+    try:
+        while filled < args.steps:
+            while len(parts) < 2 * args.workers:
+                k = next(first)
+                numbers = range(k, k + 5)
+                part = pool.submit(play, args.env, policy, args.seed, numbers)
+                parts.append(part)
+            signal.signal(signal.SIGINT, interrupt)
+            columns, episode_return = parts.popleft().result()
+            end = min(filled + len(columns[0]), args.steps)
+            for column, new in zip(data.values(), columns, strict=True):
+                column[filled:end] = new[: end - filled]
+            filled = end
+            yield filled, episode_return
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+# --- SAC ------------------------------------------------------------------------------
 
 
 def mlp(inputs, outputs):
@@ -69,90 +204,64 @@ def sample_action(actor, observation):
     return torch.tanh(before_tanh), log_prob.sum(-1, keepdim=True)
 
 
-def main(args: Args):
-    wpc.make_envs(args.env, 1).close()  # exits if the scripts can't use it
-    env_id = wpc.gymnasium_id(args.env)
-    env = gym.make(env_id)
+def learn(args, env, data):
+    """Fills `data`; yields how many rows are filled and the last episode's return."""
     env.action_space.seed(args.seed)
     torch.manual_seed(args.seed)
-    obs_dim, action_dim = env.observation_space.shape[0], env.action_space.shape[0]
+    state_dim, action_dim = env.observation_space.shape[0], env.action_space.shape[0]
     max_action = float(env.action_space.high[0])
-    data = {
-        "observations": torch.zeros(args.steps, obs_dim),
-        "actions": torch.zeros(args.steps, action_dim),
-        "rewards": torch.zeros(args.steps),
-        "terminals": torch.zeros(args.steps, dtype=torch.bool),
-        "timeouts": torch.zeros(args.steps, dtype=torch.bool),
-    }
-    next_observations = torch.zeros(args.steps, obs_dim)
+    tensors = {key: torch.from_numpy(column) for key, column in data.items()}
 
-    actor = mlp(obs_dim, 2 * action_dim)
-    critics = nn.ModuleList(mlp(obs_dim + action_dim, 1) for _ in range(2))
+    actor = mlp(state_dim, 2 * action_dim)
+    critics = nn.ModuleList(mlp(state_dim + action_dim, 1) for _ in range(2))
     targets = copy.deepcopy(critics)
     log_alpha = torch.zeros(1, requires_grad=True)
     actor_optimizer = torch.optim.Adam(actor.parameters(), args.lr, fused=True)
     critic_optimizer = torch.optim.Adam(critics.parameters(), args.lr, fused=True)
     alpha_optimizer = torch.optim.Adam([log_alpha], args.lr)
 
-    observation, _ = env.reset(seed=args.seed)
-    episode_return, progress = 0.0, trange(args.steps)
-    for t in progress:
+    state, _ = env.reset(seed=args.seed)
+    last_return, episode_return = np.nan, 0.0
+    for t in range(args.steps):
         if t < args.random_steps:
             action = env.action_space.sample()
         else:
             with torch.no_grad():
-                action = (
-                    max_action
-                    * sample_action(
-                        actor, torch.as_tensor(observation, dtype=torch.float32)
-                    )[0].numpy()
-                )
-        next_observation, reward, terminated, truncated, _ = env.step(action)
-        row = (
-            observation,
-            action,
-            reward,
-            terminated,
-            truncated or t + 1 == args.steps,
-        )
+                action, _ = sample_action(actor, torch.from_numpy(np.float32(state)))
+            action = max_action * action.numpy()
+        next_state, reward, terminal, truncated, _ = env.step(action)
+        row = (state, action, reward, next_state, terminal, truncated and not terminal)
         for column, value in zip(data.values(), row, strict=True):
-            column[t] = torch.as_tensor(value)
-        next_observations[t] = torch.as_tensor(next_observation)
-        observation, episode_return = next_observation, episode_return + reward
-        if terminated or truncated:
-            progress.set_postfix(episode_return=f"{episode_return:.0f}")
-            observation, episode_return = env.reset()[0], 0.0
+            column[t] = value
+        state, episode_return = next_state, episode_return + reward
+        if terminal or truncated:
+            last_return, episode_return = episode_return, 0.0
+            state, _ = env.reset()
+        yield t + 1, last_return
         if t < args.random_steps:
             continue
 
         i = torch.randint(t + 1, (args.batch_size,))
-        o, a, r, done = (
-            data["observations"][i],
-            data["actions"][i] / max_action,
-            data["rewards"][i],
-            data["terminals"][i],
-        )
+        s, s_next = tensors["observations"][i], tensors["next_observations"][i]
+        a, r = tensors["actions"][i] / max_action, tensors["rewards"][i, None]
+        running = ~tensors["terminals"][i, None]
         alpha = log_alpha.exp().detach()
         with torch.no_grad():
-            next_a, log_prob = sample_action(actor, next_observations[i])
-            next_oa = torch.cat([next_observations[i], next_a], 1)
-            next_v = (
-                torch.minimum(targets[0](next_oa), targets[1](next_oa))
-                - alpha * log_prob
-            )
-            y = r[:, None] + args.discount * ~done[:, None] * next_v
-        oa = torch.cat([o, a], 1)
-        critic_loss = F.mse_loss(critics[0](oa), y) + F.mse_loss(critics[1](oa), y)
+            a_next, log_prob = sample_action(actor, s_next)
+            sa_next = torch.cat([s_next, a_next], 1)
+            q_next = torch.minimum(targets[0](sa_next), targets[1](sa_next))
+            y = r + args.discount * running * (q_next - alpha * log_prob)
+        sa = torch.cat([s, a], 1)
+        critic_loss = F.mse_loss(critics[0](sa), y) + F.mse_loss(critics[1](sa), y)
         critic_optimizer.zero_grad()
         critic_loss.backward()
         critic_optimizer.step()
 
-        pi, log_prob = sample_action(actor, o)
+        pi, log_prob = sample_action(actor, s)
         critics.requires_grad_(False)
-        oa = torch.cat([o, pi], 1)
-        actor_loss = (
-            alpha * log_prob - torch.minimum(critics[0](oa), critics[1](oa))
-        ).mean()
+        sa = torch.cat([s, pi], 1)
+        q = torch.minimum(critics[0](sa), critics[1](sa))
+        actor_loss = (alpha * log_prob - q).mean()
         actor_optimizer.zero_grad()
         actor_loss.backward()
         actor_optimizer.step()
@@ -167,17 +276,80 @@ def main(args: Args):
                 list(targets.parameters()), list(critics.parameters()), args.tau
             )
 
+
+# --- The file -------------------------------------------------------------------------
+
+
+def reason(error):
+    return f"{type(error).__name__}: {error}".split("\n")[0]
+
+
+def try_to_write(path):
+    """Exits with the system's reason if `path` can't be written; changes nothing."""
+    exists = path.exists()
+    try:
+        path.open("ab").close()
+    except OSError as error:
+        sys.exit(f"--out can't be written: {error}")
+    if not exists:
+        path.unlink()
+
+
+def describe(env, data):
+    """A line on the episodes of the data, and their SHA-256."""
+    ends = np.flatnonzero(data["terminals"] | data["timeouts"]) + 1
+    rewards = np.split(data["rewards"].astype(float), ends)[: len(ends)]
+    returns = [x.sum() for x in rewards]
+    line = f"{len(ends):,} episodes, return {np.mean(returns):.1f} +- "
+    line += f"{np.std(returns):.1f}, largest {np.max(returns):.1f}"
+    if robot := wpc.d4rl_robot(env):
+        _, low, high = robot
+        line += f"; D4RL's score {100 * (np.mean(returns) - low) / (high - low):.1f}"
+    digest = hashlib.sha256()
+    for column in data.values():
+        digest.update(column.tobytes())
+    return f"{line}\nSHA-256 of the arrays: {digest.hexdigest()}"
+
+
+def write(args, data):
+    """Writes the file, and prints what is in it and the command that trains on it."""
+    data["timeouts"][-1] = not data["terminals"][-1]  # the last episode is cut off
     with h5py.File(args.out, "w") as file:
-        file.attrs["env_id"] = env_id
         for key, column in data.items():
-            file.create_dataset(
-                key,
-                data=column.numpy(),
-                compression="gzip",
-                compression_opts=9,
-                shuffle=True,
-            )
+            file.create_dataset(key, data=column, compression="gzip", shuffle=True)
+    rows = len(data["timeouts"])
+    print(f"{args.out}: {rows:,} transitions in {describe(args.env, data)}")
+    command = ["python", "wpc.py", "--env", args.env, "--dataset", str(args.out)]
+    print(f"to train: {shlex.join(command)}")
+
+
+def main(args):
+    try_to_write(args.out)
+    env = make_env(args.env)  # exits if the scripts can't use it
+    states = np.zeros((args.steps, *env.observation_space.shape), np.float32)
+    data = {
+        "observations": states,
+        "actions": np.zeros((args.steps, *env.action_space.shape), np.float32),
+        "rewards": np.zeros(args.steps, np.float32),
+        "next_observations": states.copy(),
+        "terminals": np.zeros(args.steps, bool),
+        "timeouts": np.zeros(args.steps, bool),
+    }
+    fill = collect if args.policy or args.random else learn
+    filled = 0
+    try:
+        with tqdm(total=args.steps, disable=None) as progress:
+            for filled, episode_return in fill(args, env, data):
+                progress.set_postfix_str(f"return {episode_return:.0f}", refresh=False)
+                progress.update(filled - progress.n)
+    except KeyboardInterrupt:
+        print("stopped")
+    finally:  # also where an environment or a worker fails
+        if filled:
+            write(args, {key: column[:filled] for key, column in data.items()})
+    if not filled:
+        sys.exit("nothing was collected")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(tyro.cli(Args, description=__doc__))

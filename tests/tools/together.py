@@ -18,6 +18,7 @@ does.
 
 import copy
 import csv
+import hashlib
 import importlib
 import itertools
 import json
@@ -30,6 +31,8 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import gymnasium as gym
+import mujoco
 import numpy as np
 import torch
 import torch.nn as nn
@@ -486,8 +489,8 @@ def main():
     on_gpu = options.device == "cuda"
     made_by = {
         "made_by": "tests/tools/together.py",
-        "torch": torch.__version__,
-        "numpy": np.__version__,
+        "script_sha256": hashlib.sha256(wpc.SCRIPT.read_bytes()).hexdigest(),
+        **{x.__name__: x.__version__ for x in (torch, gym, mujoco, np)},
         "trained_on": torch.cuda.get_device_name() if on_gpu else "cpu",
         "matrix_products": "tf32" if options.tf32 else "float32",
     }

@@ -1,0 +1,658 @@
+# SPDX-License-Identifier: MIT
+"""The tools that make datasets and films: make_dataset.py, from_minari.py, play.py.
+
+tests/data/minari holds datasets that Minari's own DataCollector made (see
+tests/tools/make_minari_data.py): some episodes of Hopper-v5 end and some are cut off,
+all of Pendulum-v1's are cut off, and CartPole-v1's actions are discrete.
+"""
+
+import re
+import shlex
+import sys
+import warnings
+from dataclasses import asdict
+
+import gymnasium as gym
+import h5py
+import minari
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, assert_one_sentence, run, run_here, wpc
+from gymnasium.spaces import Box, Dict, Discrete
+from minari.data_collector import EpisodeBuffer
+from PIL import Image
+from scipy.stats import norm
+
+sys.path.insert(0, str(ROOT / "tests/tools"))
+import from_minari
+import make_dataset
+import play
+
+MINARI = ROOT / "tests/data/minari/test"
+D4RL = ROOT.parent / "shared/d4rl"  # not in the repository
+SHORT = ["--max-timesteps", 2, "--eval-freq", 2, "--eval-episodes", 1]
+SHORT += ["--batch-size", 32, "--device", "cpu"]
+
+
+def read(path):
+    with h5py.File(path) as file:
+        return {key: file[key][:] for key in file}
+
+
+def refusal_of(main, args):
+    """The sentence with which a tool ends."""
+    with pytest.raises(SystemExit) as stop:
+        main(args)
+    assert isinstance(stop.value.code, str) and "\n" not in stop.value.code
+    return stop.value.code
+
+
+def run_printed_command(output, run_dir):
+    """Runs the command that a tool printed last, for a few steps."""
+    line = output.splitlines()[-1].removeprefix("to train: ")
+    run_here(wpc, *shlex.split(line), *SHORT, "--run-dir", run_dir)
+    assert (run_dir / "checkpoint.pt").exists()
+
+
+# make_dataset.py
+
+
+def collect(out, steps, **options):
+    make_dataset.main(make_dataset.Args("hopper", steps, out, **options))
+    return read(out)
+
+
+def random_policy():
+    """A policy of Hopper's shapes, by the names of D4RL's files."""
+    rng = np.random.default_rng(0)
+    layers = {"fc0": (256, 11), "fc1": (256, 256)}
+    layers |= dict.fromkeys(("last_fc", "last_fc_log_std"), (3, 256))
+    arrays = {}
+    for layer, shape in layers.items():
+        arrays[f"{layer}.weight"] = rng.normal(size=shape, scale=0.1)
+        arrays[f"{layer}.bias"] = rng.normal(size=shape[0], scale=0.1)
+    return arrays
+
+
+@pytest.fixture
+def policy(tmp_path):
+    """The file of a policy."""
+    np.savez(tmp_path / "policy.npz", **random_policy())
+    return tmp_path / "policy.npz"
+
+
+def test_a_policy_in_a_d4rl_file(tmp_path, policy):
+    with h5py.File(tmp_path / "d4rl.hdf5", "w") as file:
+        for name, array in random_policy().items():
+            file[f"metadata/policy/{name.replace('.', '/')}"] = array
+    theirs = make_dataset.load_policy(tmp_path / "d4rl.hdf5", 11, 3)
+    ours = make_dataset.load_policy(policy, 11, 3)
+    for pair, other in zip(ours, theirs, strict=True):
+        assert all(map(np.array_equal, pair, other))
+
+
+@pytest.mark.parametrize("robot", wpc.D4RL_ROBOTS)
+def test_the_policy_gives_the_probabilities_that_d4rl_recorded(robot):
+    if not D4RL.exists():
+        pytest.skip(f"{D4RL} is not there")
+    data = np.load(D4RL / f"episodes/{robot}_medium-v2.npz")
+    states, actions = data["observations"], data["actions"].astype(float)
+    path = D4RL / f"policies/{robot}_medium.npz"
+    policy = make_dataset.load_policy(path, states.shape[1], actions.shape[1])
+    outputs = [make_dataset.distribution(policy, state) for state in states]
+    means, stds = zip(*outputs, strict=True)
+    unsaturated = np.abs(actions).max(1) < 0.999  # else float32 tells too little
+    ours = norm.logpdf(np.arctanh(actions.clip(-0.9999, 0.9999)), means, stds)
+    ours = (ours - np.log(1 - actions**2 + 1e-6)).sum(1)
+    theirs = data["action_log_probs"]
+    assert unsaturated.mean() > 0.2
+    assert ours[unsaturated] == pytest.approx(theirs[unsaturated], abs=0.01)
+
+
+def test_episodes_are_the_same_for_any_number_of_workers(tmp_path, policy, capsys):
+    one = collect(tmp_path / "1.hdf5", 300, policy=policy, workers=1)
+    outputs = [capsys.readouterr().out]
+    two = collect(tmp_path / "2.hdf5", 300, policy=policy, workers=2)
+    outputs.append(capsys.readouterr().out)
+    assert all(np.array_equal(one[key], two[key]) for key in one)
+    digests = [re.search("arrays: ([0-9a-f]{64})\n", x).group(1) for x in outputs]
+    assert digests[0] == digests[1]
+
+
+def test_rows_follow_from_each_other_in_d4rls_physics(tmp_path, policy):
+    play = make_dataset.play
+    policy = make_dataset.load_policy(policy, 11, 3)
+    columns, episode_return = play("hopper", policy, 7, [3])
+    _, actions, rewards, next_states, terminals, timeouts = columns
+    assert terminals.nonzero()[0] == len(terminals) - 1 and not timeouts.any()
+    assert rewards.sum() == pytest.approx(episode_return)
+    assert np.array_equal(columns[0][1:], next_states[:-1])
+    assert all(x.dtype == np.float32 for x in columns[:4])
+
+    rng = np.random.default_rng([7, 3])
+    env = wpc.make_envs("hopper", 1).envs[0]
+    state, _ = env.reset(seed=int(rng.integers(2**31)))
+    assert np.array_equal(columns[0][0], np.float32(state))
+    for i, action in enumerate(actions):
+        state, reward, *_ = env.step(action)
+        assert np.array_equal(next_states[i], np.float32(state))
+        assert rewards[i] == np.float32(reward)
+
+    again, _ = play("hopper", policy, 7, [2, 3])  # after another episode
+    assert np.array_equal(again[1][-len(actions) :], actions)
+    other_seed, _ = play("hopper", policy, 8, [3])
+    assert not np.array_equal(other_seed[0][0], columns[0][0])
+    uniform, _ = play("hopper", None, 7, range(20))
+    assert np.histogram(uniform[1], 4, (-1, 1))[0] / uniform[1].size == pytest.approx(
+        [0.25] * 4, abs=0.05
+    )
+
+
+def test_actions_reach_the_bounds():
+    zeros = np.zeros((256, 256)), np.zeros(256)
+    w, b = np.zeros((1, 256)), np.full(1, 100.0)
+    policy = [(np.zeros((256, 3)), zeros[1]), zeros, (w, b), (w, -b)]
+    columns, _ = make_dataset.play("Pendulum-v1", policy, 0, [0])
+    assert (columns[1] == 2).all() and columns[5].nonzero()[0] == 199
+    policy = [*policy[:3], (w, b)]
+    mean, std = make_dataset.distribution(policy, np.zeros(3))
+    assert mean == 100 and std == pytest.approx(np.exp(2))  # as D4RL's SAC
+
+
+def test_the_file_is_cut_off_at_its_last_step(tmp_path, capsys):
+    path = tmp_path / "random data.hdf5"
+    data = collect(path, 100, random=True, workers=1)
+    assert {len(column) for column in data.values()} == {100}
+    assert data["timeouts"].nonzero()[0].tolist() == [99] and not data["terminals"][99]
+    output = capsys.readouterr().out
+    ends = data["terminals"].nonzero()[0]
+    returns = [x.sum() for x in np.split(data["rewards"].astype(float), ends + 1)]
+    score = 100 * (np.mean(returns) + 20.272305) / (3234.3 + 20.272305)
+    expected = f"100 transitions in {len(returns)} episodes, return "
+    expected += f"{np.mean(returns):.1f} +- {np.std(returns):.1f}, largest "
+    expected += f"{np.max(returns):.1f}; D4RL's score {score:.1f}"
+    assert expected in output
+    run_printed_command(output, tmp_path / "run")
+
+
+def test_what_sac_met_is_written(tmp_path):
+    path = tmp_path / "made.hdf5"
+    args = make_dataset.Args("Pendulum-v1", 250, path, random_steps=240)
+    make_dataset.main(args)
+    data = read(path)
+    assert data["timeouts"].nonzero()[0].tolist() == [199, 249]
+    assert np.array_equal(data["observations"][1:200], data["next_observations"][:199])
+    assert not np.array_equal(data["observations"][200], data["next_observations"][199])
+    assert 1 < np.abs(data["actions"]).max() <= 2
+    env = gym.make("Pendulum-v1").unwrapped
+    env.reset()
+    for i in range(250):  # with the actions that were taken, random or SAC's
+        cos, sin, velocity = data["observations"][i].astype(float)
+        env.state = np.array([np.arctan2(sin, cos), velocity])
+        state, reward, *_ = env.step(data["actions"][i])
+        assert data["next_observations"][i] == pytest.approx(state, abs=1e-4)
+        assert data["rewards"][i] == pytest.approx(reward, abs=1e-4)
+
+
+class Stop:
+    """An environment in which Ctrl-C is pressed at a step, or that fails there."""
+
+    def __init__(self, env, step, error=KeyboardInterrupt):
+        self.env, self.steps_left, self.error = env, step, error
+
+    def __getattr__(self, name):
+        return getattr(self.env, name)
+
+    def step(self, action):
+        if self.steps_left == 0:
+            raise self.error
+        self.steps_left -= 1
+        return self.env.step(action)
+
+
+def test_ctrl_c_writes_what_sac_met(tmp_path, capsys, monkeypatch):
+    path = tmp_path / "made.hdf5"
+    args = make_dataset.Args("Pendulum-v1", 1000, path, random_steps=20)
+    make_env = make_dataset.make_env
+    monkeypatch.setattr(make_dataset, "make_env", lambda env: Stop(make_env(env), 30))
+    make_dataset.main(args)
+    data = read(path)
+    assert {len(column) for column in data.values()} == {30}
+    assert data["timeouts"][-1] and np.abs(data["observations"]).min() > 0
+    assert "30 transitions in 1 episodes" in capsys.readouterr().out
+
+    crash = make_env("Pendulum-v1"), 31, ValueError
+    monkeypatch.setattr(make_dataset, "make_env", lambda env: Stop(*crash))
+    with pytest.raises(ValueError):
+        make_dataset.main(args)
+    assert len(read(path)["rewards"]) == 31
+
+    path.unlink()
+    monkeypatch.setattr(make_dataset, "make_env", lambda env: Stop(make_env(env), 0))
+    assert refusal_of(make_dataset.main, args) == "nothing was collected"
+    assert not path.exists()
+
+
+INTERRUPTED = """
+import os, signal, sys
+sys.path.insert(0, "tests/tools")
+import make_dataset
+collect = make_dataset.collect
+def stopped(*arguments):
+    for i, progress in enumerate(collect(*arguments)):
+        yield progress
+        if i == 2:
+            os.killpg(os.getpid(), signal.SIGINT)  # as a terminal does
+make_dataset.collect = stopped
+make_dataset.main(make_dataset.Args("hopper", 100000, sys.argv[1], random=True))
+"""
+
+
+def test_ctrl_c_writes_what_the_workers_collected(tmp_path):
+    path = tmp_path / "made.hdf5"
+    line = INTERRUPTED.replace(
+        "sys.argv[1]", f"__import__('pathlib').Path({str(path)!r})"
+    )
+    process = run(sys.executable, "-c", line, cwd=ROOT, start_new_session=True)
+    assert process.returncode == 0 and process.stderr == "", process.stderr
+    data = read(path)
+    (columns, _) = make_dataset.play("hopper", None, 0, range(15))  # of three tasks
+    for ours, expected in zip(data.values(), columns, strict=True):
+        assert len(ours) == len(expected)
+    assert np.array_equal(data["actions"], columns[1])
+
+
+NO_POLICY = [
+    ("missing.hdf5", "No such file or directory"),
+    ("no policy.hdf5", "no policy as D4RL's files record it"),
+    ("no policy.npz", "no policy as D4RL's files record it"),
+    ("no file.npz", "no policy as D4RL's files record it"),
+    ("policy.npz", "for 11 states and 3 actions, and the environment has 17 and 6"),
+]
+
+
+@pytest.mark.parametrize("name, sentence", NO_POLICY)
+def test_policies_that_do_not_fit(tmp_path, policy, name, sentence):
+    np.savez(tmp_path / "no policy.npz", a=1)
+    (tmp_path / "no file.npz").write_bytes(b"nonsense")
+    with h5py.File(tmp_path / "no policy.hdf5", "w") as file:
+        file["observations"] = 1
+    out = tmp_path / "made.hdf5"
+    args = make_dataset.Args("walker2d", 10, out, policy=tmp_path / name)
+    assert sentence in refusal_of(make_dataset.main, args)
+    assert not out.exists()
+
+
+def test_environments_that_the_scripts_can_not_use(tmp_path):
+    args = make_dataset.Args("CartPole-v1", 10, tmp_path / "made.hdf5")
+    sentence = refusal_of(make_dataset.main, args)
+    assert "one-dimensional Boxes of states" in sentence
+
+
+def test_out_is_tried_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(make_dataset, "make_env", None)
+    monkeypatch.setattr(from_minari, "open_dataset", None)
+    out = tmp_path / "nofolder/made.hdf5"
+    args = make_dataset.Args("hopper", 10, out, random=True)
+    assert "--out can't be written: [Errno 2]" in refusal_of(make_dataset.main, args)
+    args = from_minari.Args("mujoco/hopper/medium-v0", out)
+    assert "--out can't be written: [Errno 2]" in refusal_of(from_minari.main, args)
+
+    (tmp_path / "there.hdf5").write_text("kept")
+    make_dataset.try_to_write(tmp_path / "there.hdf5")
+    make_dataset.try_to_write(tmp_path / "new.hdf5")
+    assert [x.name for x in tmp_path.iterdir()] == ["there.hdf5"]
+    assert (tmp_path / "there.hdf5").read_text() == "kept"
+
+
+# from_minari.py
+
+PENDULUM = "gymnasium.envs.classic_control.pendulum:PendulumEnv"
+HOPPER = "gymnasium.envs.mujoco.hopper_v5:HopperEnv"
+gym.register("ShortHopper-v0", HOPPER, max_episode_steps=25)
+gym.register("EndlessPendulum-v0", PENDULUM)
+gym.register("ShortPendulum-v0", PENDULUM, max_episode_steps=20)
+gym.register("LightPendulum-v0", PENDULUM, max_episode_steps=200, kwargs={"g": 2.0})
+gym.register("OwnPendulum-v0", lambda: gym.make("Pendulum-v1"), max_episode_steps=200)
+
+
+def convert(dataset, out, env=None):
+    from_minari.main(from_minari.Args(str(dataset), out, env))
+    return read(out)
+
+
+def buffer(i, steps, is_terminal=False, **options):
+    """An episode of Pendulum's shapes and random numbers."""
+    rng = np.random.default_rng(i)
+    ends = [False] * (steps - 1) + [True]
+    arrays = {
+        "observations": rng.normal(size=(steps + 1, 3)).astype(np.float32),
+        "actions": rng.uniform(-2, 2, (steps, 1)).astype(np.float32),
+        "rewards": list(rng.uniform(1, 2, steps)),
+        "terminations": ends if is_terminal else [False] * steps,
+        "truncations": [False] * steps if is_terminal else ends,
+        "infos": {},
+    }
+    return EpisodeBuffer(id=i, **(arrays | options))
+
+
+@pytest.fixture
+def make(tmp_path, monkeypatch):
+    """Makes a Minari dataset of episodes, and returns its name."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+
+    def make(*episodes, **options):
+        episodes = list(episodes)
+        options = {
+            "observation_space": Box(-np.inf, np.inf, (3,)),
+            "action_space": Box(-2, 2, (1,)),
+            "env": "Pendulum-v1",
+        } | options
+        with warnings.catch_warnings(action="ignore"):  # of what is left out
+            minari.create_dataset_from_buffers("test/made-v0", episodes, **options)
+        return "test/made-v0"
+
+    return make
+
+
+def assert_nothing_is_lost(path, dataset, state_dim, action_dim):
+    """The scripts make Minari's transitions of the file, and know its episodes."""
+    args = wpc.Args(env="hopper", weight="static")
+    data, mean, std, _ = wpc.load_dataset(path, state_dim, action_dim, 2.0, args)
+    for key in ("observations", "next_observations"):
+        data[key] = data[key] * std + mean
+    keys = ("observations", "actions", "rewards", "next_observations", "terminals")
+    ours = np.column_stack([data[key] for key in (*keys, "better_half")])
+
+    episodes = list(dataset.iterate_episodes())
+    returns = [np.float32(x.rewards).sum() for x in episodes]
+    expected = []
+    for x, episode_return in zip(episodes, returns, strict=True):
+        states, next_states = x.observations[:-1], x.observations[1:]
+        columns = [states, x.actions, x.rewards, next_states, x.terminations]
+        columns.append(np.full(len(x.actions), episode_return >= np.median(returns)))
+        expected.append(np.column_stack(columns))
+    expected = np.concatenate(expected)
+    # The file may have the episodes in another order; no two actions are the same.
+    ours, expected = (x[x[:, state_dim].argsort()] for x in (ours, expected))
+    assert ours == pytest.approx(expected, abs=1e-5)
+
+
+STORED = [
+    ("hopper-v0", "ShortHopper-v0", 11, 3),
+    ("pendulum-v0", "ShortPendulum-v0", 3, 1),
+]
+
+
+@pytest.mark.parametrize("name, env, state_dim, action_dim", STORED)
+def test_no_transition_of_minaris_is_lost(tmp_path, name, env, state_dim, action_dim):
+    convert(MINARI / name, tmp_path / "data.hdf5", env)
+    dataset = minari.MinariDataset(MINARI / name / "data")
+    assert_nothing_is_lost(tmp_path / "data.hdf5", dataset, state_dim, action_dim)
+
+
+def test_the_stored_episodes_end_in_both_ways():
+    dataset = minari.MinariDataset(MINARI / "hopper-v0/data")
+    ends = {bool(e.terminations[-1]) for e in dataset.iterate_episodes()}
+    assert ends == {True, False}
+
+
+@pytest.mark.parametrize("ends", [[0, 0, 0], [0, 1, 0], [0, 1, 1], [1, 0, 1, 1]])
+def test_no_transition_is_lost_however_episodes_end(tmp_path, make, ends):
+    buffers = [buffer(i, 3 + i, bool(end)) for i, end in enumerate(ends)]
+    name = make(*buffers)
+    data = convert(name, tmp_path / "data.hdf5")
+    assert_nothing_is_lost(tmp_path / "data.hdf5", minari.load_dataset(name), 3, 1)
+    steps = sum(len(x.rewards) for x in buffers)
+    assert len(data["rewards"]) == steps + ends.count(0)  # a row for each cut-off
+    assert data["timeouts"].sum() == ends.count(0)
+
+
+def test_no_transition_is_lost_if_all_episodes_are_terminal(tmp_path, make):
+    # As the scripts drop the last row, there must be one that belongs to no episode.
+    name = make(*(buffer(i, 3 + i, True) for i in range(3)))
+    convert(name, tmp_path / "data.hdf5")
+    args = wpc.Args(env="hopper")
+    data, *_ = wpc.load_dataset(tmp_path / "data.hdf5", 3, 1, 2.0, args)
+    rewards = np.concatenate([buffer(i, 3 + i).rewards for i in range(3)])
+    assert data["rewards"].ravel().tolist() == np.float32(rewards).tolist()
+    assert data["terminals"].sum() == 3
+
+
+def test_an_end_of_both_kinds_is_terminal(tmp_path, make):
+    both = [False, False, True]
+    name = make(buffer(0, 3), buffer(1, 3, terminations=both, truncations=both))
+    data = convert(name, tmp_path / "data.hdf5")
+    assert data["terminals"].tolist() == [False, False, True, *[False] * 4]
+    assert data["timeouts"].tolist() == [*[False] * 6, True]
+    assert np.array_equal(data["observations"][3:], buffer(0, 3).observations)
+
+
+def test_from_minari_prints_the_command_that_trains(tmp_path, capsys):
+    path = tmp_path / "hopper data.hdf5"
+    convert(MINARI / "hopper-v0/data", path, "ShortHopper-v0")  # the inner folder, too
+    output = capsys.readouterr().out
+    assert "190 transitions in 8 episodes of ShortHopper-v0" in output
+    assert "Minari's scores 0 and 100 are returns of 1.0 and 100.0" in output
+    run_printed_command(output, tmp_path / "run")
+
+
+def made(**options):
+    return gym.make("Pendulum-v1", **options)
+
+
+GOAL = Dict(observation=Box(-1, 1, (3,)), desired_goal=Box(-1, 1, (2,)))
+GOALS = {
+    "observation": np.zeros((4, 3), np.float32),
+    "desired_goal": np.zeros((4, 2), np.float32),
+}
+MADE = {  # options of the dataset, --env, and the sentence or None where it goes well
+    "plain": ({}, None, None),
+    "same by name": ({}, "Pendulum-v1", None),
+    "arguments": ({"env": made(g=2.0)}, None, "arguments {'g': 2.0}, not {}"),
+    "arguments, plain": ({"env": made(g=2.0)}, "Pendulum-v1", "arguments {'g': 2.0}"),
+    "arguments, given": ({"env": made(g=2.0)}, "LightPendulum-v0", None),
+    "other arguments": ({"env": made(g=3.0)}, "LightPendulum-v0", "not {'g': 2.0}"),
+    "picture": ({"env": made(render_mode="rgb_array")}, None, None),
+    "limit": ({"env": made(max_episode_steps=20)}, None, "time limit 20, not 200"),
+    "limit, given": ({"env": made(max_episode_steps=20)}, "ShortPendulum-v0", None),
+    "wrapper": (
+        {"env": gym.wrappers.ClipReward(made(), -1.0, 1.0)},
+        None,
+        "wrappers [['ClipReward', {'min_reward': -1.0, 'max_reward': 1.0}]], not []",
+    ),
+    "wrapper, given": (
+        {"env": gym.wrappers.ClipReward(made(), -1.0, 1.0)},
+        "OwnPendulum-v0",
+        None,
+    ),
+    "evaluation": ({"eval_env": made(g=2.0)}, None, "arguments {'g': 2.0}, not {}"),
+    "evaluation, given": ({"eval_env": made(g=2.0)}, "LightPendulum-v0", None),
+    "evaluation, plain": ({"env": made(g=2.0), "eval_env": made()}, None, None),
+    "no limit at all": (
+        {"env": gym.make("EndlessPendulum-v0")},
+        None,
+        "time limit (has None)",
+    ),
+    "no limit": ({"env": made(max_episode_steps=-1)}, "Pendulum-v1", None),
+    "not recorded": ({"env": None}, None, "records no environment: name it with --env"),
+    "not recorded, given": ({"env": None}, "Pendulum-v1", None),
+    "no such environment": ({}, "Nonsense-v0", "Nonsense-v0 can't be made (NameNot"),
+    "other states": ({}, "MountainCarContinuous-v0", "states (3,), not (2,)"),
+    "other actions": ({}, "CartPole-v1", "actions [[-2.0], [2.0]], not Discrete(2)"),
+    "other bounds": (
+        {"action_space": Box(-1, 1, (1,)), "actions": np.zeros((3, 1), np.float32)},
+        None,
+        "actions [[-1.0], [1.0]], not [[-2.0], [2.0]]",
+    ),
+    "discrete": (
+        {"action_space": Discrete(2), "actions": np.array([0, 1, 0])},
+        None,
+        "actions in Discrete(2), and the policy's are continuous",
+    ),
+    "dict": (
+        {"observation_space": GOAL, "observations": GOALS},
+        None,
+        "not in a Box of one axis: make a dataset of them flattened",
+    ),
+    "short": (
+        {"observations": np.zeros((3, 3), np.float32)},
+        None,
+        "episode 0 has 3 actions and 3 observations, not 4",
+    ),
+}
+
+
+@pytest.mark.parametrize("options, env, sentence", MADE.values(), ids=MADE)
+def test_the_environment_must_be_the_recorded_one(
+    tmp_path, make, capsys, options, env, sentence
+):
+    arrays = {k: options[k] for k in ("observations", "actions") if k in options}
+    options = {k: x for k, x in options.items() if k not in arrays}
+    name, out = make(buffer(0, 3, **arrays), **options), tmp_path / "data.hdf5"
+    args = from_minari.Args(name, out, env)
+    if sentence is None:
+        from_minari.main(args)
+        command = f"python wpc.py --env {env or 'Pendulum-v1'} --dataset {out}"
+        assert capsys.readouterr().out.endswith(f"to train: {command}\n")
+    else:
+        assert sentence in refusal_of(from_minari.main, args)
+        assert not out.exists()
+
+
+def test_an_empty_dataset(tmp_path, make):
+    name = make(buffer(0, 3))
+    file = tmp_path / "minari/test/made-v0/data/metadata.json"
+    text = file.read_text().replace('"total_steps": 3', '"total_steps": 0')
+    file.write_text(text)
+    args = from_minari.Args(name, tmp_path / "data.hdf5")
+    assert refusal_of(from_minari.main, args) == "test/made-v0 is empty"
+
+
+@pytest.mark.parametrize("name", [str(ROOT / "tests"), "nonsense"])
+def test_what_is_no_dataset_of_minaris(tmp_path, name):
+    args = from_minari.Args(name, tmp_path / "data.hdf5")
+    sentence = refusal_of(from_minari.main, args)
+    assert "can't be opened or downloaded by Minari" in sentence
+
+
+# play.py
+
+
+def save_run(folder, env, state_dim, action_dim, max_action=1.0):
+    """A run folder with what play.py reads, and its policy."""
+    torch.manual_seed(0)
+    actor = wpc.Actor(state_dim, action_dim, max_action)
+    mean, std = torch.randn(state_dim), 1 + torch.rand(state_dim)
+    checkpoint = {
+        "args": asdict(wpc.Args(env=env, dataset="data.hdf5")),
+        "agent": {"actor": actor.state_dict()},
+        "mean": mean,
+        "std": std,
+        "max_action": max_action,
+    }
+    torch.save(checkpoint, folder / "checkpoint.pt")
+    return actor, mean, std
+
+
+@pytest.fixture
+def hopper_run(tmp_path, monkeypatch):
+    """A run folder, its policy, mean and std, where Hopper can be filmed."""
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    try:
+        env = gym.make("Hopper-v5", render_mode="rgb_array")
+        env.reset()
+        env.render()
+    except Exception as error:
+        pytest.skip(f"EGL does not work here ({error})")
+    env.close()
+    monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    return tmp_path, *save_run(tmp_path, "hopper", 11, 3)
+
+
+def test_the_film_is_of_the_run(hopper_run, capsys):
+    folder, actor, mean, std = hopper_run
+    play.main(play.Args(folder, folder / "policy.gif", seed=5, size=60))
+    env = wpc.make_envs("hopper", 1).envs[0]
+    state, _ = env.reset(seed=5)
+    episode_return, steps, over = 0.0, 0, False
+    while not over:
+        with torch.no_grad():
+            action = actor((torch.tensor(state).float() - mean) / std).numpy()
+        state, reward, terminated, truncated, _ = env.step(action)
+        episode_return += reward
+        steps, over = steps + 1, terminated or truncated
+    score = 100 * (episode_return + 20.272305) / (3234.3 + 20.272305)
+    expected = f"{steps} steps, return {episode_return:.1f}, D4RL's score {score:.1f}"
+    assert expected in capsys.readouterr().out
+    with Image.open(folder / "policy.gif") as film:
+        assert film.size == (60, 60) and film.n_frames == -(-steps // 4)  # 125 fps
+        assert film.info["duration"] == 30 and "loop" in film.info
+
+
+def test_frames_as_files(hopper_run):
+    folder = hopper_run[0]
+    play.main(play.Args(folder, folder / "frames", frames=3, size=60))
+    names = sorted(x.name for x in (folder / "frames").iterdir())
+    assert names == ["0000.png", "0001.png", "0002.png"]
+    pictures = [np.array(Image.open(folder / "frames" / name)) for name in names]
+    assert pictures[0].shape == (60, 60, 3) and np.ptp(pictures[0]) > 100
+    assert not np.array_equal(pictures[0], pictures[2])
+    play.main(play.Args(folder, folder / "frames/f%02d.png", frames=1, size=60))
+    assert (folder / "frames/f00.png").exists()
+
+
+def test_the_camera_follows_the_robot(hopper_run):
+    args = play.Args(hopper_run[0], hopper_run[0], seed=5)
+    env, observation = play.start(args, "hopper")
+    assert np.array_equal(observation, gym.make("Hopper-v5").reset(seed=5)[0])
+    env.unwrapped.data.qpos[0] += 20
+    env.step(np.zeros(3))
+    red, _, blue = np.moveaxis(env.render().astype(int), -1, 0)
+    env.close()
+    assert (red > blue + 40).sum() > 500  # it is brown, and nothing else is
+
+
+def test_a_missing_graphics_library(tmp_path):
+    save_run(tmp_path, "hopper", 11, 3)
+    line = [ROOT / "tests/tools/play.py", tmp_path, "--out", tmp_path / "policy.gif"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MUJOCO_GL", "osmesa")
+        patch.setenv("PYOPENGL_PLATFORM", "egl")  # which contradicts that
+        process = run(sys.executable, *line)
+    assert_one_sentence(process, "MuJoCo needs EGL or OSMesa (on Debian, apt install")
+
+
+NO_FILM = [
+    ("policy.mov", "must end in .gif, .mp4 or %04d.png, or be a folder"),
+    ("policy.png", "must end in .gif, .mp4 or %04d.png, or be a folder"),
+    ("policy%d.gif", "must end in .gif, .mp4 or %04d.png, or be a folder"),
+    ("nofolder/policy.gif", "--out can't be written: [Errno 2]"),
+    ("checkpoint.pt/x/%d.png", "--out can't be written: [Errno 20]"),
+    ("policy.mp4", "pip install imageio-ffmpeg"),
+    ("policy.gif", "Unfilmed-v0 can't be filmed ("),
+]
+gym.register("Unfilmed-v0", PENDULUM, max_episode_steps=9, kwargs={"unknown": 1})
+
+
+@pytest.mark.parametrize("out, sentence", NO_FILM)
+def test_films_that_can_not_be_made(tmp_path, monkeypatch, out, sentence):
+    monkeypatch.setattr(play.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    save_run(tmp_path, "Unfilmed-v0", 3, 1)
+    refusal = refusal_of(play.main, play.Args(tmp_path, tmp_path / out))
+    assert sentence in refusal and "MuJoCo" not in refusal
+    assert [x.name for x in tmp_path.iterdir()] == ["checkpoint.pt"]
+
+
+def test_films_of_what_is_no_run(tmp_path):
+    args, sentences = play.Args(tmp_path, tmp_path / "policy.gif"), []
+    sentences.append(refusal_of(play.main, args))
+    (tmp_path / "checkpoint.pt").write_bytes(b"nonsense")
+    sentences.append(refusal_of(play.main, args))
+    torch.save({"step": 1}, tmp_path / "checkpoint.pt")
+    sentences.append(refusal_of(play.main, args))
+    reasons = [re.search(r"can't be read \((\w+): ", x).group(1) for x in sentences]
+    assert reasons == ["FileNotFoundError", "UnpicklingError", "KeyError"]
