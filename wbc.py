@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """wBC: the weighted imitation of wPC, without its Q term, in one file.
 
-The policy stays close to the dataset's actions:
+The policy imitates the dataset's actions that are better than average:
 
-    pi = argmin E[w(s, a) * (pi(s) - a)^2]                (eq. 6 with lambda = 0)
-    w(s, a) = 1 if Q(s, a) > V(s), better than average, else 0         (eq. 7)
+    pi = argmin E[w(s, a) * (pi(s) - a)^2]                     (eq. 6 with lambda = 0)
+    w(s, a) = 1 if a is better than average, Q(s, a) > V(s), else 0       (eq. 7)
 
 Equations and Algorithm 1 are those of Peng, Han, Liu and Zhou, "Weighted Policy
 Constraints for Offline Reinforcement Learning", AAAI 2023 (below: the paper).
@@ -79,8 +79,6 @@ class Args:
     """learning rate of the actor"""
     critic_lr: float = 3e-4
     """learning rate of the critics"""
-
-    # Policy constraint
     value_lr: float = 3e-4
     """learning rate of the value network"""
 
@@ -90,11 +88,11 @@ class Args:
             self.run_dir = f"runs/{name}__{time.strftime('%Y-%m-%d_%H-%M-%S')}"
         counts = self.max_timesteps, self.eval_freq, self.eval_episodes
         if min(*counts, self.batch_size, self.policy_freq) < 1:
-            raise ValueError("steps, frequencies, episodes and batch_size start at 1")
+            raise ValueError("steps, frequencies, episodes and batch_size must be >= 1")
         if not (0 <= self.discount <= 1 and 0 <= self.tau <= 1):
-            raise ValueError("discount and tau must be from 0 to 1")
+            raise ValueError("discount and tau must be between 0 and 1")
         if not (self.dataset or d4rl_robot(self.env)):
-            raise ValueError(f"{self.env} is no task of D4RL's: --dataset is missing")
+            raise ValueError(f"{self.env} is not a D4RL task: it needs --dataset")
 
 
 # --- Networks -------------------------------------------------------------------------
@@ -170,7 +168,7 @@ class Agent:
         self.value_optimizer = adam(self.value, args.value_lr)
 
     def update(self, batch, step):
-        """Does step `step` (1, 2, ...) of Algorithm 1 and returns its metrics by name.
+        """Takes step `step` (from 1) of Algorithm 1 and returns its metrics by name.
 
         `batch` holds tensors (B, width) under the names that `load_dataset` gives them.
         """
@@ -195,7 +193,7 @@ class Agent:
         self.critic_optimizer.step()
         metrics = {"q": q1.mean(), "critic_loss": critic_loss}
 
-        # Value: V fits the same target, and so the mean of Q over the dataset's actions
+        # Value: V(s) fits the same target, so it averages Q over the dataset's actions
         v = self.value(s)
         value_loss = F.mse_loss(v, y)
         self.value_optimizer.zero_grad()
@@ -204,12 +202,12 @@ class Agent:
         metrics |= {"v": v.mean(), "value_loss": value_loss}
 
         if step % args.policy_freq == 0:
-            # Weight: 1 on the actions that are better than average, else 0
+            # Weight: 1 where the dataset's action is better than average, else 0
             with torch.no_grad():
                 advantage = self.critic.q1(s, a) - self.value(s)
                 weight = (advantage > 0).float()  # eq. 7
 
-            # Policy: the constraint alone
+            # Policy: imitate the actions of weight 1
             pi = self.actor(s)
             actor_loss = (weight * (pi - a) ** 2).mean()  # eq. 6 with lambda = 0
             self.actor_optimizer.zero_grad()
@@ -226,15 +224,15 @@ class Agent:
 
 
 def adam(network, learning_rate):
-    # Fused, as it makes a training step on a CPU a tenth faster.
+    # fused=True makes a training step on a CPU about 10% faster.
     return torch.optim.Adam(network.parameters(), learning_rate, fused=True)
 
 
 @torch.no_grad()
 def soft_update(target, network, tau):
     """target <- (1 - tau) * target + tau * network"""
-    for ours, theirs in zip(target.parameters(), network.parameters(), strict=True):
-        ours.lerp_(theirs, tau)
+    for old, new in zip(target.parameters(), network.parameters(), strict=True):
+        old.lerp_(new, tau)
 
 
 # --- Evaluation -----------------------------------------------------------------------
@@ -247,15 +245,15 @@ D4RL_ROBOTS = {  # Gymnasium's name, and the returns that D4RL scores 0 and 100
 
 
 def d4rl_robot(env):
-    """The entry of hopper or hopper-medium-v2; None of all others, as of Hopper-v4."""
+    """The entry of D4RL_ROBOTS for hopper or hopper-medium-v2; None for Hopper-v4."""
     return D4RL_ROBOTS.get(env.split("-")[0])
 
 
 def use_d4rl_physics(env):
-    """Moves a -v4 robot as MuJoCo 2.0 did, with which D4RL was recorded and is scored.
+    """Makes a -v4 robot move as in MuJoCo 2.0, where D4RL was recorded and is scored.
 
     A capsule then had the mass and inertia of a cylinder that is longer by half a
-    radius at each end (exact since MuJoCo 2.1.2), and contact margins counted half.
+    radius at each end (exact since MuJoCo 2.1.2), and contact margins were not added.
     """
     model = env.unwrapped.model
     spec = mujoco.MjSpec.from_file(env.unwrapped.fullpath)
@@ -267,20 +265,20 @@ def use_d4rl_physics(env):
             geom.size = [radius, half_length + radius / 2, 0]
             geom.pos = capsule.pos
             geom.quat = capsule.quat
-            geom.fromto = [np.nan] * 6  # or it would count instead of these
+            geom.fromto = [np.nan] * 6  # if set, it would override size, pos and quat
     old_model = spec.compile()
     for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
         getattr(model, name)[:] = getattr(old_model, name)
     model.geom_margin /= 2
-    mujoco.mj_setConst(model, env.unwrapped.data)  # what derives from the masses
+    mujoco.mj_setConst(model, env.unwrapped.data)  # recompute what masses determine
     return env
 
 
 def make_envs(env, num_envs):
     """`num_envs` environments for a task, robot or Gymnasium id, stepped together."""
     warnings.filterwarnings("ignore", ".*out of date")  # -v4 is what we want
-    name, *_ = d4rl_robot(env) or [env]
-    wrappers = [use_d4rl_physics] if d4rl_robot(env) else None
+    robot = d4rl_robot(env)
+    name, wrappers = (robot[0], [use_d4rl_physics]) if robot else (env, None)
     envs = gym.make_vec(name, num_envs, vectorization_mode="sync", wrappers=wrappers)
     states, actions = envs.single_observation_space, envs.single_action_space
     time_limit = envs.envs[0].spec.max_episode_steps
@@ -292,8 +290,8 @@ def make_envs(env, num_envs):
         and time_limit
     ):
         sys.exit(
-            f"--env {env} needs states in a Box of one axis (has {states}), actions in "
-            f"one from -x to x (has {actions}) and a time limit (has {time_limit})"
+            f"--env {env} needs one-dimensional Boxes of states (has {states}) and of "
+            f"actions from -x to x (has {actions}), and a time limit (has {time_limit})"
         )
     return envs
 
@@ -304,7 +302,7 @@ def evaluate(envs, actor, mean, std, args):
 
     Returns the mean and deviation of the returns and, on D4RL's robots, the score.
     """
-    # Environment i gets this plus i as its seed, so no two seeds share an episode.
+    # Runs of different seeds share no start: environment i is seeded with this plus i.
     observations, _ = envs.reset(seed=1000 * (args.seed + 100))
     returns = np.zeros(envs.num_envs)
     running = np.full(envs.num_envs, True)
@@ -330,7 +328,7 @@ D4RL_SERVERS = (
 
 
 def download_dataset(task):
-    """The path of D4RL's file for a task, downloaded if d4rl's folder has none."""
+    """Path of a task's D4RL file, downloaded unless it is in d4rl's folder."""
     name = task.replace("-", "_").replace("_v2", "-v2.hdf5")
     folder = os.environ.get("D4RL_DATASET_DIR", "~/.d4rl/datasets")
     path = Path(os.path.expanduser(folder), name)
@@ -355,11 +353,11 @@ def load_dataset(path, state_dim, action_dim, max_action, args):
 
     Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]), or with the
     file's own next_observations[i]. The last row gives none, nor does one with a
-    timeout, as its o[i + 1] is in the next episode.
+    timeout, as d4rl has it: its o[i + 1] is in the next episode.
 
-    Returns them by name, float32 tensors (N, width), the mean and std of the states,
-    each (state_dim,), by which they are normalized, and the best discounted return from
-    any row on. Exits with a sentence if the file doesn't fit.
+    Returns them by name, float32 tensors (N, width) with normalized states; the mean
+    and std, each (state_dim,), that normalize them; and the best discounted return from
+    any row on, to compare Q with. Exits with a sentence if the file doesn't fit.
     """
     arrays, widths = {}, {"observations": state_dim, "actions": action_dim}
     widths |= {"rewards": 1, "terminals": 1, "timeouts": 1}
@@ -376,7 +374,7 @@ def load_dataset(path, state_dim, action_dim, max_action, args):
                 array, rows = np.float32(file[key][:]), len(file["observations"])
                 if array.size != rows * width or not np.isfinite(array).all():
                     sys.exit(
-                        f"{path}: {key} must be {(rows, width)} finite numbers, and "
+                        f"{path}: {key} must be finite, in shape {(rows, width)}; it "
                         f"has shape {array.shape}"
                     )
                 arrays[key] = array.reshape(rows, width)
@@ -390,7 +388,7 @@ def load_dataset(path, state_dim, action_dim, max_action, args):
         f"--env {args.env} allows {max_action:g}"
     )
     if not keep.size or largest > 1.001 * max_action:
-        sys.exit(f"{facts}: there must be some, and no larger actions")
+        sys.exit(f"{facts}: it needs a transition, and no action above that")
     print(facts)
     arrays.setdefault("next_observations", np.roll(arrays["observations"], -1, axis=0))
 
@@ -433,7 +431,7 @@ def save(run_dir, checkpoint):
     content, table = io.BytesIO(), io.StringIO()
     torch.save(checkpoint, content)  # to memory first, as a full disk breaks torch.save
     write_file(run_dir / "checkpoint.pt", content.getvalue())
-    rows = checkpoint["evaluations"]
+    rows = checkpoint["evaluations"]  # at step 0 there are no losses yet
     writer = csv.DictWriter(table, max(rows, key=len), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
@@ -455,16 +453,16 @@ def train(args):
 
     torch.manual_seed(args.seed)
     agent = Agent(state_dim, action_dim, max_action, args)
-    torch.manual_seed(args.seed)  # again: batches and noise depend on no network
+    torch.manual_seed(args.seed)  # again, so that all scripts draw the same batches
 
     run_dir, first_step, metrics, evaluations = Path(args.run_dir), 0, {}, []
     path = run_dir / "checkpoint.pt"
     if path.exists():
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        changed = dict(checkpoint["args"].items() ^ asdict(args).items())
-        changed = changed.keys() - {"max_timesteps", "device", "dataset", "run_dir"}
+        pairs = dict(checkpoint["args"].items() ^ asdict(args).items())
+        changed = pairs.keys() - {"max_timesteps", "device", "dataset", "run_dir"}
         if changed:
-            sys.exit(f"the run in {run_dir} has another {' and '.join(changed)}")
+            sys.exit(f"{run_dir} was run with another {' and '.join(changed)}")
         for name, state in checkpoint["agent"].items():
             getattr(agent, name).load_state_dict(state)
         torch.set_rng_state(checkpoint["rng_state"])
@@ -480,7 +478,7 @@ def train(args):
     clock = time.perf_counter()
     clock_step = first_step
     for step in trange(first_step, args.max_timesteps + 1, disable=None):
-        if step:  # step 0 is an evaluation alone, to see that the environment works
+        if step:  # at step 0 only evaluate, to find a broken environment early
             batch = sample_batch(dataset, args.batch_size)
             metrics |= agent.update(batch, step)
         if step % args.eval_freq and step < args.max_timesteps:
@@ -521,7 +519,7 @@ def main():
     if args.run_dir not in sys.argv:
         command += ["--run-dir", args.run_dir]
     command = shlex.join(command)
-    print(f"to continue  {command}")
+    print(f"to continue: {command}")
     try:
         train(args)
     except KeyboardInterrupt:
