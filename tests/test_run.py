@@ -15,7 +15,6 @@ import signal
 import subprocess
 import sys
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -131,7 +130,7 @@ def test_args_json_says_what_the_run_is_of(finished):
     digest = hashlib.sha256((ROOT / "wpc.py").read_bytes()).hexdigest()
     assert record.pop("script_sha256") == digest
     for package in ("torch", "gymnasium", "mujoco", "numpy"):
-        assert record.pop(package) == version(package)
+        assert record.pop(package) == importlib.import_module(package).__version__
     args = wpc.Args(**record)  # nothing else is in it
     assert (args.env, args.dataset) == ("halfcheetah", str(DATASET))
     assert (args.max_timesteps, args.eval_freq, args.alpha) == (60, 30, 2.5)
@@ -259,7 +258,7 @@ def test_killed_at_random(tmp_path):
     run_here(wpc, *line, "--run-dir", tmp_path / "whole")
     rng, killed = random.Random(0), tmp_path / "killed"
     checkpoint = killed / "checkpoint.pt"
-    for _ in range(3):
+    for _ in range(2):
         if checkpoint.exists() and load(killed)["step"] > 32:
             shutil.rmtree(killed)  # nearly done: from the start again
         before = checkpoint.stat().st_mtime_ns if checkpoint.exists() else 0

@@ -131,8 +131,7 @@ def test_each_run_leaves_what_its_script_leaves(tmp_path):
     flags += "--max-timesteps 20 --eval-freq 10"
     lines = [
         f"python {name}.py {flags} --seed {seed} --run-dir {tmp_path / name}{seed}"
-        for name in ("wpc", "td3_bc", "wbc")
-        for seed in (0, 1)
+        for name, seed in (("wpc", 0), ("td3_bc", 0), ("wbc", 1))
     ]
     (tmp_path / "commands.txt").write_text("\n".join(lines))
     line = [sys.executable, ROOT / "tests/tools/together.py"]
