@@ -64,6 +64,14 @@ def test_the_diff_is_part_of_the_real_one():
         assert change in real, change
 
 
+def test_its_scores_are_the_reports():
+    tables = (ROOT / "tests/results/tables.md").read_text()
+    scores = re.findall(r"\d+\.\d ± \d+\.\d", README)
+    assert len(scores) >= 8
+    for score in scores:
+        assert re.search(rf"(?<![\d.]){re.escape(score)}(?![\d.])", tables), score
+
+
 def prose(text):
     """The README's words without code, tables, and what links lead to."""
     text = re.sub(r"^```.*?^```$|^\|.*?$|<!--.*?-->", "", text, flags=re.M | re.S)
