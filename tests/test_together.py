@@ -111,6 +111,24 @@ def test_the_traced_steps_are_the_steps(float64):
         torch.testing.assert_close(metric, plain.metrics[name])
 
 
+@pytest.mark.parametrize(
+    "lines, sentence",
+    [
+        (["wpc.py --tau 0.1", "td3_bc.py"], "all runs must have the same tau"),
+        (["wpc.py --value-lr 1", "td3_bc.py", "wbc.py"], "the same value_lr"),
+        (["wpc.py", "td3_bc.py --eval-freq 10"], "the same eval_freq"),
+        (["wpc.py --policy-freq 1"], "runs with policy_freq 2"),
+        (["wpc.py --eval-freq 15"], "an eval_freq that 10 divides"),
+        ([], "must have runs"),
+    ],
+)
+def test_runs_that_can_not_be_one_are_refused(tmp_path, lines, sentence):
+    path = tmp_path / "commands.txt"
+    path.write_text("\n".join(f"python {line}" for line in lines))
+    with pytest.raises(SystemExit, match=sentence):
+        together.read_commands(path)
+
+
 def test_the_random_weight_is_permuted_within_each_run():
     other_weight = together.weight_of_each_run(["random", "binary", "random", "one"])
     weight = torch.tensor([0.0, 0.0, 1.0]).repeat(4, 1)[..., None]

@@ -384,12 +384,24 @@ def evaluate_run(args, dims, actor, mean, std):
 
 
 def read_commands(path):
-    """The arguments of each line of a file of commands."""
+    """The arguments of each line of a file of commands.
+
+    Exits with a sentence if the runs can't be trained as one.
+    """
     runs = []
     for line in path.read_text().splitlines():
         _, file, *flags = shlex.split(line)
         script = importlib.import_module(Path(file).stem)
         runs.append(tyro.cli(script.Args, args=flags))
+        for name in (*SHARED, "eval_freq"):
+            ours, first = getattr(runs[-1], name, None), getattr(runs[0], name, None)
+            if None not in (ours, first) and ours != first:
+                sys.exit(f"{path}: all runs must have the same {name}, as in line 1")
+    if not runs or runs[0].policy_freq != 2 or runs[0].eval_freq % CYCLE:
+        sys.exit(
+            f"{path} must have runs with policy_freq 2 and an eval_freq that {CYCLE} "
+            "divides"
+        )
     return runs
 
 
@@ -407,6 +419,8 @@ def load(runs, device):
             # With the static weight's column, whether a run needs it or not
             options = wpc.Args(env=args.env, weight="static", device="cpu")
             data[path] = wpc.load_dataset(path, *dims[robot], options)
+    if len({max_action for _, _, max_action in dims.values()}) > 1:
+        sys.exit("the robots' actions must all have the same bounds")
     own_dims = [dims[args.env.split("-")[0]] for args in runs]
     own_data = [data[args.dataset or wpc.download_dataset(args.env)] for args in runs]
     return Runs(runs, own_dims, own_data, device)
