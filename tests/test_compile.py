@@ -234,6 +234,8 @@ def test_graphs_on_a_gpu_do_the_scripts_steps(monkeypatch, script):
             del done[self.before :]  # nothing runs while a graph is captured
             self.graph.steps = lambda: done.extend(captured)
 
+    waits = []
+
     class Stream:
         def __enter__(self):
             pass
@@ -241,13 +243,20 @@ def test_graphs_on_a_gpu_do_the_scripts_steps(monkeypatch, script):
         def __exit__(self, *_):
             pass
 
+        def wait_stream(self, other):
+            waits.append((self, other))
+
+    other = Stream()
+
     monkeypatch.setattr(torch.cuda, "Stream", Stream)
     monkeypatch.setattr(torch.cuda, "stream", lambda stream: stream)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda: other)
     monkeypatch.setattr(torch.cuda, "CUDAGraph", PretendGraph)
     monkeypatch.setattr(torch.cuda, "graph", Capture)
     graphs = compiled.Graphs(Agent(), update, lambda dataset, size: (dataset, size))
     for step in range(1, 31):
         assert "q" in graphs("dataset", step)
+        assert waits[-2:] == [(graphs.stream, other), (other, graphs.stream)]
     assert done == [(("dataset", 256), step % 3 == 0) for step in range(1, 31)]
     assert len(graphs.graphs) == 2
 

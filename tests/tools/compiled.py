@@ -118,13 +118,18 @@ class Graphs:
         freq = self.agent.args.policy_freq
         kind = step % freq == 0  # one graph with the policy's update, one without
         self.seen += 1
+        self.stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self.stream):
             if self.seen <= 2 * freq:
-                return self.one_step(dataset, step)
-            if kind not in self.graphs:
-                self.capture(kind, dataset, step)
-            self.graphs[kind].replay()
-        return self.metrics[kind]
+                metrics = self.one_step(dataset, step)
+            else:
+                if kind not in self.graphs:
+                    self.capture(kind, dataset, step)
+                self.graphs[kind].replay()
+                metrics = self.metrics[kind]
+        # Evaluation and checkpoints read on the other stream what this one has written.
+        torch.cuda.current_stream().wait_stream(self.stream)
+        return metrics
 
     def capture(self, kind, dataset, step):
         optimizers = [
@@ -149,11 +154,10 @@ def install(script):
         script.other_weight = gathered(script.other_weight)
 
     def compiled_update(agent, batch, step):
-        if agent not in steps:
-            on_gpu = agent.args.device == "cuda"
-            make = Graphs if on_gpu else compile_update
-            rest = (update, sample_batch) if on_gpu else (update,)
-            steps[agent] = make(agent, *rest)
+        if agent not in steps and agent.args.device == "cuda":
+            steps[agent] = Graphs(agent, update, sample_batch)
+        elif agent not in steps:
+            steps[agent] = compile_update(agent, update)
         return steps[agent](batch, step)
 
     def sample(dataset, batch_size):
