@@ -95,7 +95,7 @@ class Args:
             self.alpha = 0.1 if "medium-expert" in self.env else 2.5
         if self.run_dir is None:
             name = f"{Path(self.dataset or self.env).stem}__{SCRIPT.stem}__{self.seed}"
-            self.run_dir = f"runs/{name}__{time.strftime('%Y-%m-%d_%H-%M-%S')}"
+            self.run_dir = f"runs/{name}__{time.strftime('%F_%H-%M-%S')}_{os.getpid()}"
         counts = self.max_timesteps, self.eval_freq, self.eval_episodes
         if min(*counts, self.batch_size, self.policy_freq) < 1:
             raise ValueError("steps, frequencies, episodes and batch_size must be >= 1")
@@ -543,7 +543,7 @@ def train(args):
 
 def main():
     args = tyro.cli(Args, description=__doc__)
-    command = ["python", *sys.argv]
+    command = [*sys.orig_argv]
     if args.run_dir not in sys.argv:
         command += ["--run-dir", args.run_dir]
     command = shlex.join(command)
