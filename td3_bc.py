@@ -491,8 +491,8 @@ def train(args):
 
 def main():
     args = tyro.cli(Args, description=__doc__)
-    command = [*sys.orig_argv]
-    if args.run_dir not in sys.argv:
+    command = sys.orig_argv
+    if args.run_dir not in command:
         command += ["--run-dir", args.run_dir]
     command = shlex.join(command)
     print(f"to continue: {command}")

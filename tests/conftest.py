@@ -109,6 +109,7 @@ def run_here(script, *line):
     """Runs a command line in this process, which saves the seconds of a start."""
     time.sleep(1 - time.time() % 1)  # TensorBoard's files are in order by the second
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "orig_argv", [str(x) for x in line])
         patch.setattr(sys, "argv", [str(x) for x in line[1:]])
         script.main()
 

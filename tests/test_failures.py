@@ -167,6 +167,7 @@ def run_main(monkeypatch, script, error):
 
     monkeypatch.setattr(script, "train", train)
     monkeypatch.setattr(sys, "argv", ["script.py"])
+    monkeypatch.setattr(sys, "orig_argv", ["python", "script.py"])
     script.main()
 
 

@@ -56,7 +56,7 @@ def test_a_run_from_start_to_end(monkeypatch, capfd, tmp_path, name):
     output, errors = capfd.readouterr()
     assert errors == ""
     lines = output.splitlines()
-    assert len(lines) == 5 and lines[0].startswith("to continue: python ")
+    assert len(lines) == 5 and lines[0].startswith(f"to continue: {sys.executable} ")
     assert "89,910 transitions, with actions up to 1" in lines[1]
     (run_dir,) = Path("runs").iterdir()
     assert run_dir.name.startswith(f"halfcheetah_replay__{name}__0__20")
@@ -171,9 +171,9 @@ def test_every_start_has_a_new_run_folder(script, monkeypatch):
     clock = ["2026-01-01_00-00-01", "2026-01-01_00-00-02"]
     monkeypatch.setattr(script.time, "strftime", lambda _: clock.pop(0))
     name = script.SCRIPT.stem
-    first = f"runs/hopper-medium-v2__{name}__7__2026-01-01_00-00-01"
+    first = f"runs/hopper-medium-v2__{name}__7__2026-01-01_00-00-01_{os.getpid()}"
     assert script.Args(seed=7).run_dir == first
-    second = f"runs/my.data__{name}__0__2026-01-01_00-00-02"
+    second = f"runs/my.data__{name}__0__2026-01-01_00-00-02_{os.getpid()}"
     assert script.Args(dataset="folder/my.data.hdf5").run_dir == second
 
 
@@ -245,7 +245,7 @@ def test_stopped_while_saving(monkeypatch, finished, tmp_path, moment):
     real_save = wpc.save
     monkeypatch.setattr(wpc, "save", save)
     line = command("wpc", "--run-dir", tmp_path)
-    assert refusal(wpc, *line).startswith("stopped; to continue: python ")
+    assert refusal(wpc, *line).startswith(f"stopped; to continue: {sys.executable} ")
     monkeypatch.undo()
     assert load(tmp_path)["step"] == (0 if moment == "before" else 30)
     run_here(wpc, *line)
@@ -280,7 +280,7 @@ def test_output_piped_to_head_loses_nothing(finished, tmp_path):
     """The pipe breaks when the next evaluation is printed; by then it is saved."""
     line = command("wpc", "--run-dir", tmp_path)
     process = run("sh", "-c", f"{shlex.join(line)} | head -1")
-    assert process.stdout.startswith("to continue: python "), process
+    assert process.stdout.startswith(f"to continue: {sys.executable} "), process
     assert load(tmp_path)["step"] == 30
     time.sleep(1)
     run_here(wpc, *line)

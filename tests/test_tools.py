@@ -11,6 +11,7 @@ import shlex
 import sys
 import warnings
 from dataclasses import asdict
+from pathlib import Path
 
 import gymnasium as gym
 import h5py
@@ -282,6 +283,39 @@ def test_policies_that_do_not_fit(tmp_path, policy, name, sentence):
     args = make_dataset.Args("walker2d", 10, out, policy=tmp_path / name)
     assert sentence in refusal_of(make_dataset.main, args)
     assert not out.exists()
+
+
+@pytest.fixture
+def full_disk(monkeypatch):
+    """The first file that is written fills the disk, and leaves what fitted on it."""
+    write_file, calls = wpc.write_file, []
+
+    def fill(path, content):
+        calls.append(path)
+        if len(calls) > 1:
+            return write_file(path, content)
+        Path(f"{path}.tmp").write_bytes(content[:10])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(wpc, "write_file", fill)
+
+
+def test_a_full_disk_loses_nothing_that_was_collected(tmp_path, full_disk, capsys):
+    out = tmp_path / "data.hdf5"
+    make_dataset.main(make_dataset.Args("hopper", 50, out, random=True))
+    printed = capsys.readouterr().out
+    assert f"{out} can't be written: [Errno 28] No space left on device" in printed
+    assert not list(tmp_path.iterdir())
+    (elsewhere,) = re.findall(r"--dataset (.*)", printed)
+    assert len(read(Path(elsewhere))["rewards"]) == 50
+
+
+def test_a_full_disk_ends_from_minari_in_a_sentence(tmp_path, full_disk):
+    dataset, out = str(MINARI / "hopper-v0"), tmp_path / "data.hdf5"
+    args = from_minari.Args(dataset, out, "ShortHopper-v0")
+    sentence = refusal_of(from_minari.main, args)
+    assert "data.hdf5 can't be written: [Errno 28]" in sentence
+    assert not list(tmp_path.iterdir())
 
 
 def test_environments_that_the_scripts_can_not_use(tmp_path):

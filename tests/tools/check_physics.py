@@ -77,6 +77,8 @@ def main(args: Args):
         states, *others = read_rows(args.file, args.rows)
     except (OSError, KeyError) as error:
         sys.exit(f"{args.file}: {error}")
+    if wpc.make_envs(stock, 1).single_observation_space.shape != states.shape[1:]:
+        sys.exit(f"{args.file} has observations {states.shape}: it isn't {robot}'s")
     clipped = np.zeros(len(states), dtype=bool)
     if robot != "halfcheetah":
         clipped = (np.abs(states) >= 10).any(axis=1)
@@ -91,8 +93,6 @@ def main(args: Args):
     print("|---|---|---|---|")
     for name, env in (("D4RL's physics", robot), (f"stock {stock}", stock)):
         env = wpc.make_envs(env, 1).envs[0]
-        if env.observation_space.shape != states.shape[1:]:
-            sys.exit(f"{args.file} has observations {states.shape}: it isn't {robot}'s")
         *errors, differ = repeat(env, *rows)
         cells = [f"{np.nanmedian(x):.2g} ({np.nanmax(x):.2g})" for x in errors]
         print(f"| {name} | {' | '.join(cells)} | {differ} |")

@@ -20,14 +20,13 @@ from pathlib import Path
 from typing import Annotated
 
 import gymnasium as gym
-import h5py
 import minari
 import numpy as np
 import tyro
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from make_dataset import reason, try_to_write
+from make_dataset import reason, try_to_write, write_hdf5
 
 import wpc
 
@@ -174,9 +173,10 @@ def main(args):
     check_spaces(dataset)
     env = choose_env(dataset, args.env)
     columns = convert(dataset)
-    with h5py.File(args.out, "w") as file:
-        for key, column in columns.items():
-            file.create_dataset(key, data=column, compression="gzip", shuffle=True)
+    try:
+        write_hdf5(args.out, columns)
+    except OSError as error:
+        sys.exit(f"--out {args.out} can't be written: {error}")
     print(
         f"{args.out}: {dataset.total_steps:,} transitions in "
         f"{dataset.total_episodes:,} episodes of {env}"

@@ -20,12 +20,14 @@ first 1,000 of them random.
 import copy
 import functools
 import hashlib
+import io
 import itertools
 import multiprocessing
 import os
 import shlex
 import signal
 import sys
+import tempfile
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -311,15 +313,32 @@ def describe(env, data):
     return f"{line}\nSHA-256 of the arrays: {digest.hexdigest()}"
 
 
+def write_hdf5(path, columns):
+    """Writes arrays by name to an HDF5 file, whole or not at all. Raises OSError."""
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:  # in memory, as HDF5 breaks on a full disk
+        for key, column in columns.items():
+            file.create_dataset(key, data=column, compression="gzip", shuffle=True)
+    try:
+        wpc.write_file(path, content.getvalue())
+    except OSError:
+        Path(f"{path}.tmp").unlink(missing_ok=True)
+        raise
+
+
 def write(args, data):
     """Writes the file, and prints what is in it and the command that trains on it."""
     data["timeouts"][-1] = not data["terminals"][-1]  # the last episode is cut off
-    with h5py.File(args.out, "w") as file:
-        for key, column in data.items():
-            file.create_dataset(key, data=column, compression="gzip", shuffle=True)
+    out = args.out
+    try:
+        write_hdf5(out, data)
+    except OSError as error:
+        print(f"{out} can't be written: {error}")
+        out = Path(tempfile.mkdtemp(), out.name)
+        write_hdf5(out, data)
     rows = len(data["timeouts"])
-    print(f"{args.out}: {rows:,} transitions in {describe(args.env, data)}")
-    command = ["python", "wpc.py", "--env", args.env, "--dataset", str(args.out)]
+    print(f"{out}: {rows:,} transitions in {describe(args.env, data)}")
+    command = ["python", "wpc.py", "--env", args.env, "--dataset", str(out)]
     print(f"to train: {shlex.join(command)}")
 
 

@@ -157,7 +157,10 @@ def main(args):
         progress.update()
     progress.close()
     env.close()
-    write(path, images, steps_per_second / every)
+    try:
+        write(path, images, steps_per_second / every)
+    except OSError as error:
+        sys.exit(f"--out {args.out} can't be written: {error}")
     line = f"{args.out}: {step:,} steps, return {episode_return:.1f}"
     if robot := wpc.d4rl_robot(name):
         _, low, high = robot
