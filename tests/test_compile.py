@@ -31,6 +31,7 @@ from conftest import (
 
 sys.path.insert(0, str(ROOT / "tests/tools"))
 compiled = importlib.import_module("compiled")
+benchmark = importlib.import_module("benchmark")
 
 VARIANTS = [
     (script, {"policy_freq": n}) for script in (wpc, td3_bc, wbc) for n in (2, 3)
@@ -259,6 +260,38 @@ def test_graphs_on_a_gpu_do_the_scripts_steps(monkeypatch, script):
         assert waits[-2:] == [(graphs.stream, other), (other, graphs.stream)]
     assert done == [(("dataset", 256), step % 3 == 0) for step in range(1, 31)]
     assert len(graphs.graphs) == 2
+
+
+def test_what_the_benchmark_compares_runs():
+    for step in (benchmark.textbook_steps(), benchmark.product_steps()):
+        assert benchmark.Steps(step).run(2) > 0
+    for name in ("wpc", "td3_bc", "wbc"):
+        script = importlib.import_module(name)
+        step = benchmark.script_steps(script, compiled=False)
+        assert benchmark.Steps(step).run(2) > 0
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+@pytest.mark.parametrize("policy_freq", [1, 2, 3])
+def test_graphs_are_the_scripts_steps_to_the_last_bit(script, policy_freq):
+    args = script.Args(device="cuda", policy_freq=policy_freq)
+    torch.manual_seed(1)
+    dataset = {name: x.repeat(10, 1).cuda() for name, x in random_batch().items()}
+    states = []
+    for graphs in (False, True):
+        torch.manual_seed(0)
+        agent = script.Agent(5, 2, 1.0, args)
+        steps = compiled.Graphs(agent, script.Agent.update, script.sample_batch)
+        for step in range(1, 2001):
+            if graphs:
+                metrics = steps(dataset, step)
+            else:
+                batch = script.sample_batch(dataset, args.batch_size)
+                metrics = agent.update(batch, step)
+        metrics = {name: metric.item() for name, metric in metrics.items()}
+        torch.cuda.synchronize()
+        states.append((metrics, state(agent), torch.cuda.get_rng_state()))
+    torch.testing.assert_close(*states, rtol=0, atol=0)
 
 
 def test_the_scripts_agents_are_those_of_networks():

@@ -418,6 +418,7 @@ def load(runs, device):
         if path not in data:
             # With the static weight's column, whether a run needs it or not
             options = wpc.Args(env=args.env, weight="static", device="cpu")
+            options.discount = args.discount
             data[path] = wpc.load_dataset(path, *dims[robot], options)
     if len({max_action for _, _, max_action in dims.values()}) > 1:
         sys.exit("the robots' actions must all have the same bounds")
