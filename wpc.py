@@ -274,10 +274,10 @@ def d4rl_robot(env):
 
 
 def use_d4rl_physics(env):
-    """Makes a -v4 robot move as in MuJoCo 2.0, where D4RL was recorded and is scored.
+    """Makes a -v4 robot move as in MuJoCo 2.0, with which D4RL was recorded.
 
-    A capsule then had the mass and inertia of a cylinder that is longer by half a
-    radius at each end (exact since MuJoCo 2.1.2), and contact margins were not added.
+    A capsule then had the mass and inertia of its cylindrical part, lengthened by half
+    a radius at each end (exact since MuJoCo 2.1.2), and contact margins were not added.
     """
     model = env.unwrapped.model
     spec = mujoco.MjSpec.from_file(env.unwrapped.fullpath)
@@ -310,7 +310,7 @@ def make_envs(env, num_envs):
         type(states) is type(actions) is gym.spaces.Box
         and len(states.shape) == len(actions.shape) == 1
         and actions.is_bounded()
-        and np.ptp(np.abs([actions.low, actions.high])) == 0
+        and np.ptp([-actions.low, actions.high]) == 0
         and time_limit
     ):
         sys.exit(
@@ -353,7 +353,7 @@ D4RL_SERVERS = (
 
 def download_dataset(task):
     """Path of a task's D4RL file, downloaded unless it is in d4rl's folder."""
-    name = task.replace("-", "_").replace("_v2", "-v2.hdf5")
+    name = task.removesuffix("-v2").replace("-", "_") + "-v2.hdf5"
     folder = os.environ.get("D4RL_DATASET_DIR", "~/.d4rl/datasets")
     path = Path(os.path.expanduser(folder), name)
     if path.exists():
@@ -376,12 +376,12 @@ def load_dataset(path, state_dim, action_dim, max_action, args):
     """The transitions of an HDF5 file in D4RL's format, as in d4rl.qlearning_dataset.
 
     Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]), or with the
-    file's own next_observations[i]. The last row gives none, nor does one with a
-    timeout, as d4rl has it: its o[i + 1] is in the next episode.
+    file's own next_observations[i]. The last row gives none, nor does a row with a
+    timeout, as its o[i + 1] would be in the next episode; d4rl drops them even then.
 
     Returns them by name, float32 tensors (N, width) with normalized states; the mean
-    and std, each (state_dim,), that normalize them; and the best discounted return from
-    any row on, to compare Q with. Exits with a sentence if the file doesn't fit.
+    and std, each (state_dim,), that normalize them; and the rows' best discounted
+    return-to-go, to compare Q with. Exits with a sentence if the file doesn't fit.
     """
     arrays, widths = {}, {"observations": state_dim, "actions": action_dim}
     widths |= {"rewards": 1, "terminals": 1, "timeouts": 1}
@@ -419,7 +419,7 @@ def load_dataset(path, state_dim, action_dim, max_action, args):
     rewards = arrays["rewards"].ravel().tolist()
     ends = (arrays["terminals"] + timeouts).ravel() > 0
     best_return, return_to_go = -np.inf, 0.0
-    for i in reversed(range(rows)):
+    for i in reversed(range(len(rewards))):
         return_to_go = rewards[i] + args.discount * return_to_go * (not ends[i])
         best_return = max(best_return, return_to_go)
     if args.weight == "static":  # 1 in episodes of median return or more (Figure 4)
@@ -487,8 +487,8 @@ def train(args):
     path = run_dir / "checkpoint.pt"
     if path.exists():
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        pairs = dict(checkpoint["args"].items() ^ asdict(args).items())
-        changed = pairs.keys() - {"max_timesteps", "device", "dataset", "run_dir"}
+        pairs = checkpoint["args"].items() ^ asdict(args).items()  # what differs
+        changed = dict(pairs).keys() - {"max_timesteps", "device", "dataset", "run_dir"}
         if changed:
             sys.exit(f"{run_dir} was run with another {' and '.join(changed)}")
         for name, state in checkpoint["agent"].items():

@@ -23,7 +23,7 @@ def load_dataset(path, state_dim=17, action_dim=6, max_action=1.0, script=wpc, *
 
 def slow_load(arrays, discount):
     """Row by row: the transitions, by the row that they are from, the rows of each
-    episode, and the best discounted return from any row on."""
+    episode, and the rows' best discounted return-to-go."""
     flags = (arrays[key].ravel() > 0 for key in ("terminals", "timeouts"))
     terminals, timeouts = map(np.ndarray.tolist, flags)
     rewards = np.float64(np.float32(arrays["rewards"])).ravel()

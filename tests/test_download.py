@@ -126,6 +126,7 @@ def test_names_and_digests_are_d4rls(monkeypatch, tmp_path):
     for robot in wpc.D4RL_ROBOTS:
         for kind in kinds:
             path = wpc.download_dataset(f"{robot}-{kind}-v2")
+            assert path == wpc.download_dataset(f"{robot}-{kind}")  # as papers call it
             del digests[path.name]
     assert digests == {}
 

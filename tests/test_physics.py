@@ -3,6 +3,7 @@
 
 import re
 import sys
+import types
 import zipfile
 
 import mujoco
@@ -85,6 +86,26 @@ def test_masses_and_inertias_by_hand(script, robot):
     # what derives from the masses is computed again
     assert model.body_subtreemass[0] == pytest.approx(model.body_mass.sum())
     assert not np.allclose(model.dof_invweight0, stock.dof_invweight0, rtol=1e-3)
+
+
+def test_a_capsule_that_is_given_by_its_ends(script, tmp_path):
+    """As HalfCheetah's torso is, but neither centred nor along an axis."""
+    (tmp_path / "model.xml").write_text("""<mujoco><worldbody><body><freejoint/>
+        <geom name="arm" type="capsule" fromto="0 0.1 0 0.3 0.2 0.6" size="0.05"/>
+        <geom name="leg" type="capsule" pos="0 0 -0.3" size="0.04 0.2"/>
+        </body></worldbody></mujoco>""")
+    stock, model = (
+        mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml")) for _ in range(2)
+    )
+    env = types.SimpleNamespace(model=model, data=mujoco.MjData(model))
+    env.fullpath, env.unwrapped = str(tmp_path / "model.xml"), env
+    script.use_d4rl_physics(env)
+    mass, center, tensor = by_hand(stock, 1)
+    assert model.body_mass[1] == pytest.approx(mass)
+    assert model.body_ipos[1] == pytest.approx(center)
+    turn = rotation(model.body_iquat[1])
+    ours = turn @ np.diag(model.body_inertia[1]) @ turn.T
+    assert ours == pytest.approx(tensor, rel=1e-6, abs=1e-9)
 
 
 @robots

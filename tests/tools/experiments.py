@@ -441,7 +441,7 @@ NOTES = {
     "Interquartile means": "Over all runs of the tasks on which the systems have as "
     "many seeds and steps; 95% interval by a bootstrap over the seeds of each task.",
     "When does Q run away?": "Q (its mean over a batch) divided by the best discounted "
-    "return from any row of the data on, from the lowest to the highest seed: the mean "
+    "return-to-go of the data, from the lowest to the highest seed: the mean "
     "of the last ten evaluations, the largest and its step; how many seeds had it over "
     "1, and with how many of these it came back below.",
     "TD3+BC on our data and on D4RL's": "Mean score of all evaluations to this step, "

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Makes a dataset in D4RL's format, of D4RL's robots in D4RL's physics.
+"""Makes a dataset in D4RL's format; D4RL's robots move in D4RL's physics.
 
 With --policy, episodes of a stochastic policy, as in D4RL's medium and expert data, or
 with --random of uniform actions. They are the same for any number of workers.
