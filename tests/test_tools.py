@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""The tools that make datasets and films: make_dataset.py, from_minari.py, play.py.
+"""The tools that make datasets and films: make_dataset.py, from_minari.py, play.py, and
+check_steps.py.
 
 tests/data/minari holds datasets that Minari's own DataCollector made (see
 tests/tools/make_minari_data.py): some episodes of Hopper-v5 end and some are cut off,
@@ -26,6 +27,7 @@ from PIL import Image
 from scipy.stats import norm
 
 sys.path.insert(0, str(ROOT / "tests/tools"))
+import check_steps
 import from_minari
 import make_dataset
 import play
@@ -690,3 +692,63 @@ def test_films_of_what_is_no_run(tmp_path):
     sentences.append(refusal_of(play.main, args))
     reasons = [re.search(r"can't be read \((\w+): ", x).group(1) for x in sentences]
     assert reasons == ["FileNotFoundError", "UnpicklingError", "KeyError"]
+
+
+# check_steps.py
+
+PEER = """
+import sys
+
+sys.path.insert(0, {root!r})
+import {script} as script
+
+
+class TD3_BC:
+    def __init__(self, *dims):
+        self.agent = script.Agent(*dims, script.Args(device="cpu", **{options}))
+        vars(self).update(vars(self.agent))
+        if hasattr(self, "value"):
+            self.vnet = self.value
+        self.steps = 0
+
+    def train(self, replay_buffer, batch_size=256):
+        self.steps += 1
+        names = "observations", "actions", "next_observations", "rewards", "terminals"
+        batch = dict(zip(names, replay_buffer.sample(batch_size)))
+        batch["terminals"] = 1 - batch["terminals"]
+        for name in ("actor_target", "critic_target"):
+            setattr(self.agent, name, getattr(self, name))
+        self.agent.update(batch, self.steps)
+"""
+
+
+@pytest.fixture
+def float64():
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize("name", ["td3_bc", "wpc"])
+def test_steps_are_compared_with_another_file_s(tmp_path, capsys, float64, name):
+    """With a file that does the same, and with one whose discount is another."""
+
+    def differences(options):
+        text = PEER.format(root=str(ROOT), script=name, options=options)
+        (tmp_path / "peer.py").write_text(text)
+        check_steps.main(check_steps.Args([tmp_path / "peer.py"], steps=4))
+        lines = capsys.readouterr().out.splitlines()
+        assert lines[0].startswith(f"{name}.py and {tmp_path}/peer.py: ")
+        return [float(line.split(": ")[1]) for line in lines]
+
+    same, *v_before = differences({})
+    assert same == 0
+    assert len(v_before) == (name == "wpc")
+    assert min(v_before + differences({"discount": 0.98})) > 1e-6
+
+
+def test_what_is_no_file_of_td3_bc(tmp_path, float64):
+    for path, sentence in (
+        (tmp_path / "no.py", "is no file"),
+        (ROOT / "wpc.py", "TD3_BC"),
+    ):
+        assert sentence in refusal_of(check_steps.main, check_steps.Args([path]))
