@@ -377,7 +377,7 @@ def load_dataset(path, state_dim, action_dim, max_action, args):
 
     Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]), or with the
     file's own next_observations[i]. The last row gives none, nor does a row with a
-    timeout, as its o[i + 1] would be in the next episode; d4rl drops them even then.
+    timeout, whose o[i + 1] is in the next episode; d4rl drops both in either case.
 
     Returns them by name, float32 tensors (N, width) with normalized states; the mean
     and std, each (state_dim,), that normalize them; and the rows' best discounted

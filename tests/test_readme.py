@@ -10,6 +10,7 @@ import re
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -70,6 +71,46 @@ def test_its_scores_are_the_reports():
     assert len(scores) >= 8
     for score in scores:
         assert re.search(rf"(?<![\d.]){re.escape(score)}(?![\d.])", tables), score
+
+
+def scores(script, task):
+    """Steps and scores of all seeds: (evaluations,) and (seeds, evaluations)."""
+    tables = [
+        np.genfromtxt(path / "evaluations.csv", names=True, delimiter=",")[1:]
+        for path in sorted((ROOT / "tests/results/runs").glob(f"{script}__{task}__*"))
+    ]
+    return tables[0]["step"], np.stack([x["normalized_score"] for x in tables])
+
+
+def test_what_it_says_of_curves_is_in_the_runs():
+    early, jumps = [], []
+    for script in ("wpc", "td3_bc"):
+        for task in ("hopper-medium", "walker2d-medium"):
+            steps, values = scores(script, task)
+            early.append(f"{values[:, steps <= 100_000].mean():.1f}")
+        steps, values = scores(script, "hopper-medium-replay")
+        jumps.append(np.abs(np.diff(values[:, steps > 500_000])))
+    first = "wPC averages {} on *hopper-medium* and {} on *walker2d-medium*, TD3+BC {} "
+    assert (first + "and {}.").format(*early) in README
+    ours, td3_bc = (f"{np.median(x):.0f}" for x in jumps)
+    most = f"by {max(x.max() for x in jumps):.0f} at most"
+    assert f"by {td3_bc} (TD3+BC) and {ours} points (wPC)" in README and most in README
+
+
+def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
+    text = (ROOT / "tests/results/tables.md").read_text()
+    table = text.split("## Table 1")[1].split("##")[0].splitlines()
+    header, *rows = [line.split("|")[1:-1] for line in table if line.startswith("| ")]
+    count = 0
+    for row in rows:
+        cells = {k.strip(): v.split()[0] for k, v in zip(header, row, strict=True)}
+        if cells["task"].endswith("-medium"):
+            for system in ("wPC", "TD3+BC", "wBC"):
+                ours, paper = float(cells[system]), float(cells[f"{system}, paper"])
+                assert abs(ours - paper) <= 2.5
+                count += 1
+    assert count == 9
+    assert "all three algorithms score within 2.5 points of the paper" in README
 
 
 def prose(text):

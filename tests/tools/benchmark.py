@@ -12,7 +12,6 @@ and optax. All variants take turns, so that whatever else the machine does meets
 them. Ratios of medians come first, as they carry over to other machines.
 """
 
-import importlib.util
 import os
 import subprocess
 import sys
@@ -24,6 +23,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 import tyro
+from check_steps import load
 from compiled import compile_update
 from tqdm import trange
 
@@ -78,10 +78,7 @@ class Buffer:
 
 def peer_steps(path):
     """The training step of a file that has the class TD3_BC."""
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    agent, buffer = module.TD3_BC(STATE_DIM, ACTION_DIM, 1.0), Buffer()
+    agent, buffer = load(path).TD3_BC(STATE_DIM, ACTION_DIM, 1.0), Buffer()
     return lambda i: agent.train(buffer, BATCH)
 
 

@@ -26,7 +26,6 @@ import td3_bc
 import wpc
 
 DIMS = 11, 3, 1.0  # state_dim, action_dim, max_action
-NETWORKS = ("critic", "actor", "critic_target", "actor_target")
 
 
 @dataclass
@@ -75,7 +74,7 @@ class Buffer:
         return self.batch
 
 
-def largest_difference(peer, script, v_before=False, steps=300):
+def largest_difference(peer, script, steps, v_before=False):
     """Of all parameters after so many steps of a script and of a file's TD3_BC."""
     torch.manual_seed(0)
     device = str(getattr(peer, "device", "cpu"))
@@ -96,14 +95,14 @@ def largest_difference(peer, script, v_before=False, steps=300):
         torch.manual_seed(step)
         batch = {"observations": s, "actions": a, "next_observations": s_next}
         ours.update(batch | {"rewards": r, "terminals": 1 - not_done}, step)
+    names = ("critic", "actor", "critic_target", "actor_target")
+    pairs = [(getattr(ours, name), getattr(theirs, name)) for name in names]
+    if script is wpc:
+        pairs.append((ours.value, theirs.vnet))
     return max(
         (x - y).abs().max().item()
-        for name in NETWORKS
-        for x, y in zip(
-            getattr(ours, name).parameters(),
-            getattr(theirs, name).parameters(),
-            strict=True,
-        )
+        for our, their in pairs
+        for x, y in zip(our.parameters(), their.parameters(), strict=True)
     )
 
 
@@ -125,10 +124,10 @@ def main(args: Args):
         peer = load(path)
         is_wpc = hasattr(peer.TD3_BC(*DIMS), "vnet")
         script = wpc if is_wpc else td3_bc
-        difference = largest_difference(peer, script, steps=args.steps)
+        difference = largest_difference(peer, script, args.steps)
         print(f"{script.__name__}.py and {path}: {difference:.1e}", flush=True)
         if is_wpc:
-            difference = largest_difference(peer, wpc, True, args.steps)
+            difference = largest_difference(peer, wpc, args.steps, v_before=True)
             print(f"the same, with V before its update: {difference:.1e}", flush=True)
 
 
