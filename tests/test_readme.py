@@ -73,13 +73,18 @@ def test_its_scores_are_the_reports():
         assert re.search(rf"(?<![\d.]){re.escape(score)}(?![\d.])", tables), score
 
 
-def scores(script, task):
-    """Steps and scores of all seeds: (evaluations,) and (seeds, evaluations)."""
-    tables = [
+def tables(script, task):
+    """What was evaluated in the runs of all seeds, without the one at step 0."""
+    return [
         np.genfromtxt(path / "evaluations.csv", names=True, delimiter=",")[1:]
         for path in sorted((ROOT / "tests/results/runs").glob(f"{script}__{task}__*"))
     ]
-    return tables[0]["step"], np.stack([x["normalized_score"] for x in tables])
+
+
+def scores(script, task):
+    """Steps and scores of all seeds: (evaluations,) and (seeds, evaluations)."""
+    runs = tables(script, task)
+    return runs[0]["step"], np.stack([x["normalized_score"] for x in runs])
 
 
 def test_what_it_says_of_curves_is_in_the_runs():
@@ -95,6 +100,24 @@ def test_what_it_says_of_curves_is_in_the_runs():
     ours, td3_bc = (f"{np.median(x):.0f}" for x in jumps)
     most = f"by {max(x.max() for x in jumps):.0f} at most"
     assert f"by {td3_bc} (TD3+BC) and {ours} points (wPC)" in README and most in README
+
+
+def test_what_it_says_of_q_running_away_is_in_the_runs():
+    runs = tables("wpc", "walker2d-medium")
+    ratios = [x["q"] / x["best_return"] for x in runs]
+    largest = sorted(f"{ratio.max():.1f}" for ratio in ratios)
+    steps = [x["step"][r.argmax()] for x, r in zip(runs, ratios, strict=True)]
+    assert "it reached {}, {} and {} times the best".format(*largest) in README
+    assert f"by steps {min(steps):,.0f} to {max(steps):,.0f}" in README
+
+    (long,) = (x for x, r in zip(runs, ratios, strict=True) if r.max() > 5)
+    early = long["step"] <= 600_000
+    below = long["normalized_score"] < 40
+    assert below[early].mean() > 0.9 and below[~early].mean() < 0.1
+    assert "the score was mostly below 40 until step 600,000" in README
+    ends = [x["normalized_score"][-10:].mean() for x in runs]
+    lowest, highest = np.floor(min(ends)), np.ceil(max(ends))
+    assert f"all three seeds end between {lowest:.0f} and {highest:.0f}" in README
 
 
 def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
