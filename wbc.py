@@ -446,9 +446,9 @@ def train(args):
     action_dim = envs.single_action_space.shape[0]
     max_action = float(envs.single_action_space.high[0])
 
-    path = args.dataset or download_dataset(args.env)
+    dataset_path = args.dataset or download_dataset(args.env)
     dataset, mean, std, best_return = load_dataset(
-        path, state_dim, action_dim, max_action, args
+        dataset_path, state_dim, action_dim, max_action, args
     )
 
     torch.manual_seed(args.seed)
@@ -515,10 +515,9 @@ def train(args):
 
 def main():
     args = tyro.cli(Args, description=__doc__)
-    command = sys.orig_argv
+    command = shlex.join(sys.orig_argv)
     if args.run_dir not in command:
-        command += ["--run-dir", args.run_dir]
-    command = shlex.join(command)
+        command += " --run-dir " + shlex.quote(args.run_dir)
     print(f"to continue: {command}")
     try:
         train(args)

@@ -6,6 +6,7 @@ What is slow is tested on wpc.py alone: by test_twins.py it holds for the others
 
 import hashlib
 import importlib
+import itertools
 import json
 import os
 import random
@@ -16,6 +17,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -149,6 +151,18 @@ def test_an_evaluation_is_saved_before_it_is_printed(monkeypatch, tmp_path):
     monkeypatch.setattr(wpc.tqdm, "write", write)
     run_here(wpc, *command("wpc", "--run-dir", tmp_path))
     assert saved == [0, 30, 60]
+
+
+def test_steps_per_second_are_of_training_alone(monkeypatch, tmp_path):
+    """By a clock on which a second passes each time it is read."""
+    clock = SimpleNamespace(perf_counter=map(float, itertools.count()).__next__)
+    monkeypatch.setattr(wpc, "time", clock)
+    line = command("wpc", "--run-dir", tmp_path)
+    run_here(wpc, *line, "--max-timesteps", 40)
+    run_here(wpc, *line, "--max-timesteps", 60)  # its first step is not counted
+    rows = load(tmp_path)["evaluations"]
+    assert [row["step"] for row in rows] == [0, 30, 40, 60]
+    assert [row["steps_per_second"] for row in rows] == [0, 30, 10, 19]
 
 
 # Arguments
