@@ -145,6 +145,7 @@ def test_an_evaluation_is_saved_before_it_is_printed(monkeypatch, tmp_path):
     def write(line):
         step = load(tmp_path)["step"]
         assert int(read_rows(tmp_path)[-1]["step"]) == step
+        assert read_curves(tmp_path)["mean_return"][-1][0] == step
         assert line.startswith(f"step {step}: ")
         saved.append(step)
 
