@@ -54,7 +54,9 @@ SCORES = ["mean_return", "std_return", "normalized_score"]
 def test_a_run_from_start_to_end(monkeypatch, capfd, tmp_path, name):
     monkeypatch.chdir(tmp_path)
     script = SCRIPTS[name]
+    torch.set_flush_denormal(False)
     run_here(script, *command(name))
+    assert torch.tensor(1e-38) / 100 == 0  # the script flushes them again
     output, errors = capfd.readouterr()
     assert errors == ""
     lines = output.splitlines()
@@ -329,6 +331,14 @@ def test_prolonged_by_a_step_without_the_policys(run_dir):
 def test_the_data_may_move(run_dir, tmp_path):
     moved = shutil.copy(DATASET, tmp_path / "moved.hdf5")
     run_here(wpc, *command("wpc", "--run-dir", run_dir, "--dataset", moved))
+
+
+def test_a_run_of_a_gpu_goes_on_without_one(run_dir):
+    checkpoint = load(run_dir)
+    checkpoint["args"]["device"] = "cuda"
+    torch.save(checkpoint, run_dir / "checkpoint.pt")
+    run_here(wpc, *command("wpc", "--run-dir", run_dir, "--max-timesteps", 61))
+    assert load(run_dir)["step"] == 61
 
 
 CONTRADICTIONS = [
