@@ -462,7 +462,7 @@ def train(args):
 
         speed = (step - clock_step) / (time.perf_counter() - clock)
         row = {"step": step, **evaluate(envs, agent.actor, mean, std, args)}
-        row |= {"steps_per_second": speed, "best_return": best_return}
+        row |= {"steps_per_second": speed, "best_discounted_return": best_return}
         row |= {name: metric.item() for name, metric in metrics.items()}
         if not np.isfinite(list(row.values())).all():
             sys.exit(f"diverged by step {step}: {row}; the last checkpoint is kept")
@@ -481,7 +481,7 @@ def train(args):
             writer.add_scalar(name, value, step)
         writer.flush()
         save(run_dir, checkpoint)
-        shown = {"mean_return", "normalized_score", "best_return", "q"}
+        shown = {"mean_return", "normalized_score", "best_discounted_return", "q"}
         line = ", ".join(f"{name} {x:.1f}" for name, x in row.items() if name in shown)
         tqdm.write(f"step {step:,}: {line}")
         sys.stdout.flush()  # so that a log file is up to date

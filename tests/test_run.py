@@ -66,11 +66,11 @@ def test_a_run_from_start_to_end(monkeypatch, capfd, tmp_path, name):
     assert run_dir.name.startswith(f"halfcheetah_replay__{name}__0__20")
 
     rows = read_rows(run_dir)
-    assert list(rows[0]) == ["step", *SCORES, "best_return", *METRICS[name]]
+    assert list(rows[0]) == ["step", *SCORES, "best_discounted_return", *METRICS[name]]
     assert [int(row["step"]) for row in rows] == [0, 30, 60]
     for row, line in zip(rows, lines[2:], strict=True):
         assert line.startswith(f"step {row['step']}: ")
-        for column in ("mean_return", "best_return", "q"):
+        for column in ("mean_return", "best_discounted_return", "q"):
             if row[column]:
                 assert f"{column} {float(row[column]):.1f}" in line
         score = 100 * (float(row["mean_return"]) + 280.178953) / (12135.0 + 280.178953)
