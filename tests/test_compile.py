@@ -202,6 +202,15 @@ def test_a_script_must_be_named(arguments):
     assert_one_sentence(process, "name a script: python tests/tools/compiled.py wpc.py")
 
 
+def test_the_script_that_is_named_is_run(tmp_path):
+    """A copy elsewhere is that copy, not the script of its name here."""
+    text = (ROOT / "wpc.py").read_text().replace("The policy maximises Q", "My own")
+    (tmp_path / "wpc.py").write_text(text)
+    tool = ROOT / "tests/tools/compiled.py"
+    process = run(sys.executable, tool, tmp_path / "wpc.py", "--help")
+    assert process.returncode == 0 and "My own, and a constraint" in process.stdout
+
+
 class PretendGraph:
     """Does at each replay what was done while it was captured."""
 

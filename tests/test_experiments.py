@@ -22,7 +22,7 @@ STEPS = range(10, 130, 10)  # twelve evaluations
 
 
 def make_run(folder, script, dataset, seed, scores, q=5.0, steps=STEPS, **arguments):
-    """A run folder as the scripts leave it, with best_return 10."""
+    """A run folder as the scripts leave it, with best_discounted_return 10."""
     args = SCRIPTS[script].Args(
         env="hopper", dataset=f"data/{dataset}.hdf5", seed=seed, **arguments
     )
@@ -33,7 +33,7 @@ def make_run(folder, script, dataset, seed, scores, q=5.0, steps=STEPS, **argume
         "step": steps,
         "mean_return": [3.0] * (count + 1),
         "normalized_score": [0.0, *np.broadcast_to(scores, count)],
-        "best_return": [10.0] * (count + 1),
+        "best_discounted_return": [10.0] * (count + 1),
         "q": ["", *np.broadcast_to(q, count)],
     }
     with (folder / "evaluations.csv").open("w") as file:
@@ -143,6 +143,7 @@ def test_a_report_by_hand(tool, tmp_path):
     assert "passed over" not in out
 
     hopper, walker = tables["Table 1"]
+    assert hopper["the data"] == "-"  # as it is not ours, whose best return is another
     assert hopper["task"] == "hopper-medium" and walker["task"] == "walker2d-medium"
     assert hopper["wPC"] == "2.0 ± 1.0 (3; 0.12k)"
     assert hopper["TD3+BC"] == hopper["wBC"] == "4.0 ± 2.0 (3; 0.12k)"
@@ -320,15 +321,19 @@ def test_tasks_of_other_seeds_or_steps_have_means_of_their_own():
 
 
 def test_the_data_have_a_score_of_their_own(tmp_path, monkeypatch):
+    """Where the runs' best return is that of the data whose score is known."""
+    for task in ("hopper_medium", "walker2d_medium"):
+        make_run(tmp_path / task, "wpc", task, 0, 3)
+    groups = experiments.read_groups(tmp_path)
     monkeypatch.setattr(experiments, "ROOT", tmp_path)
     path = tmp_path / "tests/results/datasets.csv"
     path.parent.mkdir(parents=True)
-    path.write_text("task,episodes,mean_score\nhopper-medium,9,44.25\n")
-    table = experiments.score_table({}, ["hopper-medium", "walker2d-medium"], ["wPC"])
-    assert table.splitlines()[2:] == [
-        "| hopper-medium | 44.2 | - | 86.5 |",
-        "| walker2d-medium | - | - | 86.0 |",
-    ]
+    path.write_text(
+        "task,mean_score,best_return\nhopper-medium,44.2,10.0\nwalker2d-medium,9,11.0\n"
+    )
+    table = experiments.score_table(groups, ["hopper-medium", "walker2d-medium"], [])
+    rows = ["| hopper-medium | 44.2 |", "| walker2d-medium | - |"]
+    assert table.splitlines()[2:] == rows
 
 
 def test_a_report_without_runs(tmp_path):
@@ -352,9 +357,9 @@ def test_our_td3_bc_is_compared_with_the_published_curves(tool, tmp_path):
         path = tmp_path / str(seed)
         make_run(path, "td3_bc", "hopper_medium", seed, scores, steps=steps)
     _, tables = report(tool, tmp_path, tmp_path / "report")
-    (row,) = tables["TD3+BC on our data and on D4RL's"]
+    (row,) = tables["TD3+BC here and on D4RL's files"]
     theirs, std = np.mean(means[:20]), float(rows[19]["average_std"])
-    assert row["ours"] == f"{theirs + 2:.1f} ± 1.0 (3; 200k)"
+    assert row["these runs"] == f"{theirs + 2:.1f} ± 1.0 (3; 200k)"
     assert row["on D4RL's files"] == f"{theirs:.1f} ± {std:.1f} (5)"
     variances = np.array([1 / 3, std**2 / 5])
     freedom = variances.sum() ** 2 / (variances**2 / [2, 4]).sum()

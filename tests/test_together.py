@@ -7,6 +7,8 @@ import json
 import shlex
 import sys
 
+import h5py
+import numpy as np
 import pytest
 import torch
 from conftest import DATASET, ROOT, run, td3_bc, wbc, wpc
@@ -17,14 +19,15 @@ together = importlib.import_module("together")
 SMALL, LARGE = (5, 2, 1.0), (7, 3, 1.0)
 OPTIONS = {"device": "cpu", "policy_noise": 0.0, "batch_size": 16}
 # Without noise, which is drawn for all runs together.
+OPTIONS |= {"value_lr": 1e-3, "beta": 0.5}  # of the scripts that have them
 RUNS = [
+    (td3_bc, SMALL, {"alpha": 1.0}),
     (wpc, LARGE, {"alpha": 2.5}),
     (wpc, SMALL, {"alpha": 0.1, "seed": 1}),
-    (td3_bc, SMALL, {"alpha": 1.0}),
     (td3_bc, LARGE, {"alpha": 0.0, "seed": 2}),
     (wbc, SMALL, {"seed": 3}),
     (wbc, LARGE, {}),
-    (wpc, SMALL, {"alpha": 2.5, "weight": "exponential", "beta": 1.0}),
+    (wpc, SMALL, {"alpha": 2.5, "weight": "exponential"}),
     (wpc, LARGE, {"alpha": 2.5, "weight": "static"}),
 ]
 
@@ -55,7 +58,10 @@ def make_runs():
     datasets = {dims: make_dataset(dims) for dims in (SMALL, LARGE)}
     all_dims = [dims for _, dims, _ in RUNS]
     data = [(datasets[dims], None, None, 0.0) for dims in all_dims]
-    args = [script.Args(**OPTIONS, **options) for script, _, options in RUNS]
+    args = []
+    for script, _, options in RUNS:
+        own = {k: v for k, v in OPTIONS.items() if hasattr(script.Args, k)}
+        args.append(script.Args(**own, **options))
     return together.Runs(args, all_dims, data, "cpu")
 
 
@@ -116,6 +122,7 @@ def test_the_traced_steps_are_the_steps(float64):
     [
         (["wpc.py --tau 0.1", "td3_bc.py"], "all runs must have the same tau"),
         (["wpc.py --value-lr 1", "td3_bc.py", "wbc.py"], "the same value_lr"),
+        (["td3_bc.py", "wbc.py", "wpc.py --value-lr 1"], "the same value_lr"),
         (["wpc.py", "td3_bc.py --eval-freq 10"], "the same eval_freq"),
         (["wpc.py --policy-freq 1"], "runs with policy_freq 2"),
         (["wpc.py --eval-freq 15"], "an eval_freq that 10 divides"),
@@ -127,6 +134,26 @@ def test_runs_that_can_not_be_one_are_refused(tmp_path, lines, sentence):
     path.write_text("\n".join(f"python {line}" for line in lines))
     with pytest.raises(SystemExit, match=sentence):
         together.read_commands(path)
+
+
+def test_a_run_that_is_there_is_not_written_over(tmp_path):
+    (tmp_path / "evaluations.csv").touch()
+    (tmp_path / "commands.txt").write_text(f"python wpc.py --run-dir {tmp_path}")
+    with pytest.raises(SystemExit, match="holds a run already"):
+        together.read_commands(tmp_path / "commands.txt")
+
+
+def test_environments_of_gymnasium(tmp_path):
+    widths = {"observations": 3, "actions": 1, "rewards": 1, "terminals": 1}
+    path = tmp_path / "data.hdf5"
+    with h5py.File(path, "w") as file:
+        for name, width in (widths | {"timeouts": 1}).items():
+            file[name] = np.zeros((30, width), np.float32)
+    args = [wpc.Args("Pendulum-v1", str(path), seed=seed) for seed in (0, 1)]
+    runs = together.load(args, "cpu")
+    assert runs.dims == [(3, 1, 2.0)] * 2
+    for job, _ in runs.snapshot():
+        assert together.evaluate_run(*job)["mean_return"] < 0
 
 
 def test_the_random_weight_is_permuted_within_each_run():
@@ -161,7 +188,8 @@ def test_each_run_leaves_what_its_script_leaves(tmp_path):
         folder = tmp_path / shlex.split(line)[-1]
         rows = list(csv.DictReader((folder / "evaluations.csv").open()))
         assert [row["step"] for row in rows] == ["0", "10", "20"]
-        assert float(rows[-1]["normalized_score"]) < 5 < float(rows[-1]["best_return"])
+        assert float(rows[-1]["normalized_score"]) < 5
+        assert float(rows[-1]["best_discounted_return"]) > 5
         columns[folder.name] = rows[0].keys()
         args = json.loads((folder / "args.json").read_text())
         assert args["made_by"] == "tests/tools/together.py"

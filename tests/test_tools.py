@@ -550,7 +550,8 @@ def test_the_environment_must_be_the_recorded_one(
     args = from_minari.Args(name, out, env)
     if sentence is None:
         from_minari.main(args)
-        command = f"python wpc.py --env {env or 'Pendulum-v1'} --dataset {out}"
+        command = f"wpc.py --env {env or 'Pendulum-v1'} --dataset {out}"
+        command = f"{sys.orig_argv[0]} {command}"
         assert capsys.readouterr().out.endswith(f"to train: {command}\n")
     else:
         assert sentence in refusal_of(from_minari.main, args)

@@ -8,8 +8,8 @@ matrix products of a step, and other people's files.
 
 The second line also measures files of github.com/sfujim/TD3_BC, github.com/qsa-fox/wPC
 and github.com/nissymori/JAX-CORL, which you download yourself; the last needs jax,
-flax, optax, omegaconf and pydantic. All variants take turns, so that whatever else the
-machine does meets all of them. The table has ratios of medians, and the medians.
+flax, optax, omegaconf and pydantic. All variants take turns, so that other load
+slows all of them alike. The table has ratios of medians, and the medians.
 """
 
 import os

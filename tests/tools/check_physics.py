@@ -86,10 +86,11 @@ def main(args: Args):
 
     count = clipped.sum()
     print(
-        f"{args.file.name}: {len(clipped) - count} rows compared, {count} passed over"
+        f"{args.file.name}: {len(clipped) - count} rows compared, {count} passed over; "
+        "median (largest) error:"
     )
     print()
-    print("| median (largest) error | next observation | reward | other terminations |")
+    print("| physics | next observation | reward | terminations that differ |")
     print("|---|---|---|---|")
     for name, env in (("D4RL's physics", robot), (f"stock {stock}", stock)):
         env = wpc.make_envs(env, 1).envs[0]

@@ -37,7 +37,7 @@ class Args:
 
 
 class ValueBeforeUpdate(nn.Module):
-    """V(s) as the step's own update found it: without gradient, the same once more."""
+    """Without gradient, V(s) as last computed with it: before the step's update."""
 
     def __init__(self, value):
         super().__init__()

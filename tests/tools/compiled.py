@@ -7,7 +7,7 @@ Arguments, run folder and checkpoints are the script's, and a run may go on with
 tool or without it. On a CPU, `Agent.update` is compiled by torch.compile, which needs a
 C++ compiler and takes about a minute the first time; results agree with the script's
 but for rounding. On a GPU, sampling and update are captured as CUDA graphs, and results
-are the same to the last bit.
+should be the same to the last bit.
 """
 
 import copy
@@ -179,6 +179,7 @@ def main():
         sys.exit(
             f"set TORCHINDUCTOR_CACHE_DIR to a folder that can be written: {error}"
         )
+    sys.path.insert(0, str(Path(sys.argv[1]).resolve().parent))
     script = importlib.import_module(Path(sys.argv[1]).stem)
     install(script)
     sys.argv = sys.argv[1:]

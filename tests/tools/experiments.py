@@ -5,9 +5,10 @@
     tr '\\n' '\\0' < commands.txt | xargs -0 -n 1 -P 2 sh -c
     python tests/tools/experiments.py report --runs runs/paper --out report
 
-`list` starts nothing; the second line runs what it lists, two at a time, and continues
-what was interrupted. With a GPU, tests/tools/together.py trains many of these runs at
-once. `report` reads every run folder below --runs, whatever its name.
+`list` starts nothing; the second line, in the activated environment, runs what it
+lists, two at a time, and continues what was interrupted. With a GPU,
+tests/tools/together.py trains many of these runs at once. `report` reads every run
+folder below --runs, whatever its name.
 """
 
 import csv
@@ -146,7 +147,7 @@ def read_run(folder):
     score = "normalized_score" if "normalized_score" in rows[0] else "mean_return"
     run = {
         name: np.array([float(row.get(name) or "nan") for row in rows])
-        for name in ("step", score, "q", "best_return")
+        for name in ("step", score, "q", "best_discounted_return")
     }
     run["score"] = run.pop(score)
     if not np.isfinite(run["score"]).all() or not (np.diff(run["step"]) > 0).all():
@@ -209,7 +210,7 @@ def read_groups(folder):
             np.stack([run[name][np.isin(run["step"], steps)] for run in seeds])
             for name in ("score", "q")
         )
-        alpha, best_return = seeds[0]["alpha"], seeds[0]["best_return"][-1]
+        alpha, best_return = seeds[0]["alpha"], seeds[0]["best_discounted_return"][-1]
         groups[key] = Group(*key, alpha, best_return, np.array(steps), scores, q)
     return groups
 
@@ -237,8 +238,10 @@ def score_table(groups, tasks, systems):
     """Our scores, and beside them those that were published."""
     path = ROOT / "tests/results/datasets.csv"
     data = list(csv.DictReader(path.open())) if path.exists() else []
-    data = {row["task"]: f"{float(row['mean_score']):.1f}" for row in data}
-    header, rows = ["task", "the data"], [[task, data.get(task, "-")] for task in tasks]
+    data = {(row["task"], row["best_return"]): row["mean_score"] for row in data}
+    best = {x.task: f"{x.best_return:.1f}" for x in groups.values()}
+    header = ["task", "the data"]
+    rows = [[task, data.get((task, best[task]), "-")] for task in tasks]
     for system in systems:
         sources = [source for source in PUBLISHED if source.startswith(f"{system},")]
         header += [system, *sources]
@@ -325,7 +328,7 @@ def q_table(groups):
 
 
 def reproduction_table(pairs):
-    """TD3+BC's mean score over all evaluations, on our data and on D4RL's files."""
+    """TD3+BC's mean score over all evaluations, here and on D4RL's files."""
     rows = []
     for group, curve in pairs:
         _, i, j = np.intersect1d(group.steps, curve["step"], return_indices=True)
@@ -336,7 +339,7 @@ def reproduction_table(pairs):
             p = f"{stats.ttest_ind_from_stats(*both, equal_var=False).pvalue:.2g}"
         row = [group.task, f"{mean_and_std(ours)} ({group.size})"]
         rows.append([*row, f"{theirs:.1f} ± {std:.1f} (5)", p])
-    return markdown(["task", "ours", "on D4RL's files", "p"], rows)
+    return markdown(["task", "these runs", "on D4RL's files", "p"], rows)
 
 
 # --- The figures ----------------------------------------------------------------------
@@ -387,7 +390,7 @@ def runaway_panels(groups):
 def reproduction_panel(group, curve):
     theirs = curve["step"], [curve[name] for name in ("min", "mean", "max")]
     curves = [("on D4RL's own files (five seeds)", ("#555555", "-"), *theirs)]
-    ours = ("TD3+BC on our data", SYSTEMS["TD3+BC"], group.steps, band(group.scores))
+    ours = ("TD3+BC, these runs", SYSTEMS["TD3+BC"], group.steps, band(group.scores))
     return group.task, "score", [*curves, ours], []
 
 
@@ -432,8 +435,9 @@ INTRODUCTION = """\
 Scores are D4RL's normalized ones, or returns where a task is called "(mean return)". A
 score is the mean of a run's last ten evaluations; over seeds: mean ± sample standard
 deviation (seeds; training steps). What the paper and CORL have published is of D4RL's
-own files. "The data" is the mean score of the episodes trained on. Runs whose arguments
-differ from the scripts' defaults are in the table on Q alone.
+own files. "The data" is the mean score of the episodes trained on, where the report
+knows it (tests/results/datasets.csv). Runs whose arguments differ from the scripts'
+defaults are in the table on Q alone.
 """
 NOTES = {
     "Differences": "Mean, 95% interval and p of Welch's t test, not corrected for "
@@ -444,7 +448,7 @@ NOTES = {
     "return-to-go of the data, from the lowest to the highest seed: the mean "
     "of the last ten evaluations, the largest and its step; how many seeds had it over "
     "1, and with how many of these it came back below.",
-    "TD3+BC on our data and on D4RL's": "Mean score of all evaluations to this step, "
+    "TD3+BC here and on D4RL's files": "Mean score of all evaluations to this step, "
     "and Welch's p. The published curves are tests/results/td3_bc_on_d4rl.csv.",
 }
 
@@ -484,7 +488,7 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
         "Other weights (Table 2, Figure 4)": score_table(groups, others, weights),
         "Differences to other weights": difference_table(groups, others, weights),
         "When does Q run away?": q_table(groups),
-        "TD3+BC on our data and on D4RL's": reproduction_table(pairs),
+        "TD3+BC here and on D4RL's files": reproduction_table(pairs),
     }
     text = INTRODUCTION
     for title, table in tables.items():

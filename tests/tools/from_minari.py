@@ -107,7 +107,7 @@ def choose_env(dataset, env):
     )
     ours = as_record(plain.spec, plain.observation_space, plain.action_space)
     if spec and env and plain.spec.entry_point != spec.entry_point:
-        # What a class or function of the user's gives is not to be seen from outside.
+        # Arguments and wrappers inside the user's own entry point can't be seen here.
         for x in ("arguments", "wrappers"):
             print(f"{env} is taken to have the {x} of {spec.id}: {theirs.pop(x)}")
     if env and theirs["time limit"] is None:  # the scripts need one
@@ -185,7 +185,7 @@ def main(args):
     if metadata.get("ref_max_score") is not None:
         low, high = metadata["ref_min_score"], metadata["ref_max_score"]
         print(f"Minari's scores 0 and 100 are returns of {low} and {high}")
-    command = ["python", "wpc.py", "--env", env, "--dataset", str(args.out)]
+    command = [sys.orig_argv[0], "wpc.py", "--env", env, "--dataset", str(args.out)]
     print(f"to train: {shlex.join(command)}")
 
 

@@ -338,7 +338,7 @@ def write(args, data):
         write_hdf5(out, data)
     rows = len(data["timeouts"])
     print(f"{out}: {rows:,} transitions in {describe(args.env, data)}")
-    command = ["python", "wpc.py", "--env", args.env, "--dataset", str(out)]
+    command = [sys.orig_argv[0], "wpc.py", "--env", args.env, "--dataset", str(out)]
     print(f"to train: {shlex.join(command)}")
 
 

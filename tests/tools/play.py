@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Films an episode of the policy that a run trained; it takes no screen.
+"""Films the beginning of an episode of a trained policy; no display is needed.
 
 python tests/tools/play.py runs/RUN --out policy.gif
 """
@@ -20,8 +20,8 @@ import tyro
 from PIL import Image
 from tqdm import tqdm
 
-# Where a library is missing that this names, MuJoCo can't be imported; Gymnasium reads
-# it later, when there is a sentence to say.
+# MuJoCo can't be imported if the library that this names is missing; `start` sets it
+# again, where what is missing can be said in a sentence.
 MUJOCO_GL = os.environ.pop("MUJOCO_GL", None)
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import mujoco  # noqa: E402

@@ -226,9 +226,7 @@ class Runs:
             agents.append(wpc.Agent(*own, wpc.Args(seed=args.seed, device="cpu")))
         self.actors = [agent.actor for agent in agents]
         self.agent = agent = copy.copy(agents[0])
-        agent.args = wpc.Args(
-            **{k: v for k, v in asdict(runs[0]).items() if k in SHARED}
-        )
+        agent.args = wpc.Args(**shared(runs))
         agent.args.alpha = torch.tensor(alphas, device=device).view(-1, 1, 1)
         agent.args.weight = "each run's"
         agent.actor = copy.deepcopy(self.actors[0])
@@ -355,7 +353,12 @@ class Runs:
             for name in ABSENT[type(args).__module__] & row.keys():
                 del row[name]
             job = (args, self.dims[i], actor, mean.numpy(), std.numpy())
-            yield job, {"best_return": best_return} | row
+            yield job, {"best_discounted_return": best_return} | row
+
+
+def shared(runs):
+    """The arguments that all runs have in common, also those only some scripts have."""
+    return {k: v for args in runs for k, v in asdict(args).items() if k in SHARED}
 
 
 SHARED = ("batch_size", "discount", "tau", "policy_noise", "noise_clip", "policy_freq")
@@ -371,7 +374,7 @@ ENVS = {}
 def evaluate_run(args, dims, actor, mean, std):
     """The script's own evaluation, in a process of its own."""
     torch.set_num_threads(1)
-    key = args.env.split("-")[0], args.eval_episodes
+    key = args.env, args.eval_episodes
     if key not in ENVS:
         ENVS[key] = wpc.make_envs(args.env, args.eval_episodes)
     network = wpc.Actor(*dims)
@@ -393,10 +396,11 @@ def read_commands(path):
         _, file, *flags = shlex.split(line)
         script = importlib.import_module(Path(file).stem)
         runs.append(tyro.cli(script.Args, args=flags))
-        for name in (*SHARED, "eval_freq"):
-            ours, first = getattr(runs[-1], name, None), getattr(runs[0], name, None)
-            if None not in (ours, first) and ours != first:
-                sys.exit(f"{path}: all runs must have the same {name}, as in line 1")
+        if Path(runs[-1].run_dir, "evaluations.csv").exists():
+            sys.exit(f"{runs[-1].run_dir} holds a run already: name another --run-dir")
+    for name in (*SHARED, "eval_freq"):
+        if len({getattr(args, name) for args in runs if hasattr(args, name)}) > 1:
+            sys.exit(f"{path}: all runs must have the same {name}")
     if not runs or runs[0].policy_freq != 2 or runs[0].eval_freq % CYCLE:
         sys.exit(
             f"{path} must have runs with policy_freq 2 and an eval_freq that {CYCLE} "
@@ -409,20 +413,19 @@ def load(runs, device):
     """The runs as one, with their datasets."""
     data, dims = {}, {}
     for args in runs:
-        robot = args.env.split("-")[0]
-        if robot not in dims:
+        if args.env not in dims:
             envs = wpc.make_envs(args.env, 1)
             states, actions = envs.single_observation_space, envs.single_action_space
-            dims[robot] = states.shape[0], actions.shape[0], float(actions.high[0])
+            dims[args.env] = states.shape[0], actions.shape[0], float(actions.high[0])
         path = args.dataset or wpc.download_dataset(args.env)
         if path not in data:
             # With the static weight's column, whether a run needs it or not
-            options = wpc.Args(env=args.env, weight="static", device="cpu")
-            options.discount = args.discount
-            data[path] = wpc.load_dataset(path, *dims[robot], options)
+            options = wpc.Args(args.env, path, discount=args.discount, device="cpu")
+            options.weight = "static"
+            data[path] = wpc.load_dataset(path, *dims[args.env], options)
     if len({max_action for _, _, max_action in dims.values()}) > 1:
         sys.exit("the robots' actions must all have the same bounds")
-    own_dims = [dims[args.env.split("-")[0]] for args in runs]
+    own_dims = [dims[args.env] for args in runs]
     own_data = [data[args.dataset or wpc.download_dataset(args.env)] for args in runs]
     return Runs(runs, own_dims, own_data, device)
 
