@@ -6,8 +6,10 @@ What is traced is tested for every script, weight and frequency; it is compiled 
 for wpc.py alone, as that takes a minute.
 """
 
+import copy
 import importlib
 import sys
+import types
 
 import pytest
 import torch
@@ -28,6 +30,7 @@ from conftest import (
     wbc,
     wpc,
 )
+from torch.utils.flop_counter import FlopCounterMode
 
 sys.path.insert(0, str(ROOT / "tests/tools"))
 compiled = importlib.import_module("compiled")
@@ -211,6 +214,35 @@ def test_the_script_that_is_named_is_run(tmp_path):
     assert process.returncode == 0 and "My own, and a constraint" in process.stdout
 
 
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_what_a_script_does_otherwise(monkeypatch, script, device):
+    """On a CPU the update alone; on a GPU sampling, too, which gets the dataset."""
+    done = []
+
+    class Agent:
+        args = types.SimpleNamespace(device=device)
+        update = script.Agent.update
+
+    def graphs(agent, update, sample_batch):
+        assert sample_batch is script.sample_batch
+        return lambda dataset, step: done.append((update, dataset, step))
+
+    def compile_update(agent, update):
+        return lambda batch, step: done.append((update, batch, step))
+
+    module = types.SimpleNamespace(**vars(script) | {"Agent": Agent})
+    monkeypatch.setattr(compiled, "Graphs", graphs if device == "cuda" else None)
+    cpu = compile_update if device == "cpu" else None
+    monkeypatch.setattr(compiled, "compile_update", cpu)
+    compiled.install(module)
+    rewards = types.SimpleNamespace(is_cuda=True) if device == "cuda" else torch.ones(9)
+    dataset = {"rewards": rewards}
+    batch = module.sample_batch(dataset, 4)
+    Agent().update(batch, 7)
+    assert done == [(script.Agent.update, batch, 7)]
+    assert batch is dataset if device == "cuda" else len(batch["rewards"]) == 4
+
+
 class PretendGraph:
     """Does at each replay what was done while it was captured."""
 
@@ -271,13 +303,75 @@ def test_graphs_on_a_gpu_do_the_scripts_steps(monkeypatch, script):
     assert len(graphs.graphs) == 2
 
 
-def test_what_the_benchmark_compares_runs():
-    for step in (benchmark.textbook_steps(), benchmark.product_steps()):
-        assert benchmark.Steps(step).run(2) > 0
-    for name in ("wpc", "td3_bc", "wbc"):
-        script = importlib.import_module(name)
-        step = benchmark.script_steps(script, compiled=False)
-        assert benchmark.Steps(step).run(2) > 0
+# benchmark.py
+
+
+def test_the_benchmark_runs_the_scripts(script):
+    assert benchmark.Steps(benchmark.script_steps(script, compiled=False)).run(2) > 0
+
+
+def test_the_textbook_loop_is_wpc(monkeypatch):
+    """With the same networks and batch, four steps lead to the same parameters."""
+    batch, made = random_batch(), []
+    names = ["observations", "actions", "next_observations", "rewards"]
+    columns = [*(batch[name] for name in names), 1 - batch["terminals"]]
+    buffer = types.SimpleNamespace(sample=lambda _: columns)
+    monkeypatch.setattr(benchmark, "Buffer", lambda: buffer)
+    agent = wpc.Agent(5, 2, 1.0, wpc.Args(device="cpu"))
+
+    def copies(network):
+        def make(*_):
+            made.append(copy.deepcopy(network))
+            return made[-1]
+
+        return make
+
+    for name in ("Actor", "Critic", "Value"):
+        monkeypatch.setattr(wpc, name, copies(getattr(agent, name.lower())))
+    step = benchmark.textbook_steps()
+    for i in range(1, 5):
+        torch.manual_seed(i)
+        step(i)
+        torch.manual_seed(i)
+        agent.update(batch, i)
+    names = ("actor", "actor_target", "critic", "critic_target", "value")
+    for name, network in zip(names, made, strict=True):
+        expected = getattr(agent, name).state_dict()
+        torch.testing.assert_close(network.state_dict(), expected, rtol=1e-3, atol=1e-6)
+
+
+def test_the_bare_products_are_those_of_wpc():
+    def products(step, i):
+        with FlopCounterMode(display=False) as counter:
+            step(i)
+        return counter.get_total_flops()
+
+    bare, ours = benchmark.product_steps(), benchmark.script_steps(wpc, False)
+    assert products(bare, 1) == products(ours, 1)
+    # The gradient of Q1's parameters of the policy's loss, which nothing needs
+    unused = 2 * 256 * (14 * 256 + 256 * 256 + 256)
+    assert products(bare, 2) == products(ours, 2) - unused
+
+
+def test_the_benchmarks_table(monkeypatch, capsys):
+    speeds = {"textbook": 100.0, "products": 250.0}
+    made = {k: types.SimpleNamespace(run=lambda _, x=x: x) for k, x in speeds.items()}
+    monkeypatch.setattr(benchmark, "variants", lambda *_: made)
+    monkeypatch.setattr(benchmark.os, "sched_setaffinity", lambda *_: None)
+    monkeypatch.setattr(benchmark.os, "sched_getaffinity", lambda _: {0})
+    monkeypatch.setattr(torch, "set_num_threads", lambda _: None)
+    benchmark.main(benchmark.Args(rounds=1))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2:] == ["| textbook | 1.00 | 100 |", "| products | 2.50 | 250 |"]
+
+
+def test_speed_is_steps_a_second(monkeypatch):
+    clock = types.SimpleNamespace(perf_counter=iter([3.0, 5.0]).__next__)
+    monkeypatch.setattr(benchmark, "time", clock)
+    assert benchmark.Steps(lambda i: None).run(10) == 5
+
+
+# On a GPU
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")

@@ -65,6 +65,17 @@ def report(tool, runs, out):
     return printed, tables
 
 
+def catch_figures(monkeypatch):
+    """The panels of each figure by its name, in place of the pictures."""
+    drawn = {}
+
+    def draw(path, panels):
+        drawn[path.stem] = panels
+
+    monkeypatch.setattr(experiments, "draw", draw)
+    return drawn
+
+
 def figures(out):
     return {path.stem for path in out.glob("*.png")}
 
@@ -90,9 +101,10 @@ def test_the_scripts_take_the_commands(tool, experiment, runs):
         args = tyro.cli(SCRIPTS[script.removesuffix(".py")].Args, args=words)
         assert python == "python"
         assert (args.max_timesteps, args.eval_freq) == (1_000_000, 10_000)
-        robot, *kind = args.env.removesuffix("-v2").split("-")
-        assert args.dataset.startswith(f"data/{'_'.join([robot, *kind])}")
-        assert args.run_dir.startswith("my runs/")
+        folder, name = args.run_dir.split("/")
+        task = name.split("__")[0]  # or a part of its dataset
+        assert folder == "my runs" and task.startswith(args.env.removesuffix("-v2"))
+        assert args.dataset == f"data/{task.replace('-', '_')}.hdf5"
         folders.add(args.run_dir)
     assert len(folders) == 2 * runs
 
@@ -342,30 +354,80 @@ def test_a_report_without_runs(tmp_path):
     assert_one_sentence(process, "holds no run with ten evaluations")
 
 
+def test_other_weights_and_what_is_drawn(tool, tmp_path, monkeypatch):
+    """Each system's two runs have scores of their own, and Q is half a point higher."""
+    drawn = catch_figures(monkeypatch)
+    systems = {
+        "wPC": {},
+        "TD3+BC": {},
+        "wPC-e": {"weight": "exponential"},
+        "wPC-rnd": {"weight": "random"},
+        "static weight": {"weight": "static"},
+        "alpha 1.0": {"alpha": 1.0},
+    }
+    for i, (system, options) in enumerate(systems.items()):
+        script = "td3_bc" if system == "TD3+BC" else "wpc"
+        for seed in (0, 2):
+            run = script, "hopper_medium", seed, 10 * i + seed
+            make_run(tmp_path / f"{i}/{seed}", *run, q=run[-1] + 0.5, **options)
+    _, tables = report(tool, tmp_path, tmp_path / "report")
+    (row,) = tables["Other weights (Table 2, Figure 4)"]
+    names = list(systems)[:5]
+    assert [float(row[name].split()[0]) for name in names] == [1, 11, 21, 31, 41]
+    (row,) = tables["Differences to other weights"]
+    differences = [row[f"wPC - {name}"].split(" [")[0] for name in names[1:]]
+    assert differences == ["-10.0", "-20.0", "-30.0", "-40.0"]
+
+    def curves(panel):
+        """Lowest, mean and highest of each curve, all of which are constant."""
+        _, _, shown, _ = panel
+        return {name: [x.mean() for x in band] for name, _, _, band in shown}
+
+    expected = {name: [10 * i, 10 * i + 1, 10 * i + 2] for i, name in enumerate(names)}
+    (panel,) = drawn["figure2"]
+    assert curves(panel) == {name: expected[name] for name in names[:2]}
+    (panel,) = drawn["figure3"]
+    assert curves(panel)["TD3+BC"] == [10.5, 11.5, 12.5] and panel[3][0][0] == 10
+    q, scores = drawn["figure4"]
+    assert curves(q)["static weight"] == [40.5, 41.5, 42.5]
+    assert curves(scores)["static weight"] == expected["static weight"]
+    (panel,) = drawn["figure5"]
+    assert curves(panel) == {name: expected[name] for name in names[:4]}
+    assert [level for level, *_ in panel[3]] == [86.5, 57.7, 67.0, 66.5]  # the paper's
+    q, scores = drawn["runaway"]
+    assert curves(q)["alpha 1.0"] == pytest.approx([5.05, 5.15, 5.25])
+    assert curves(scores)["alpha 1.0"] == [50, 51, 52]
+
+
 # --- What is stored -------------------------------------------------------------------
 
 
-def test_our_td3_bc_is_compared_with_the_published_curves(tool, tmp_path):
+def test_our_td3_bc_is_compared_with_the_published_curves(tool, tmp_path, monkeypatch):
     """Their numbers at the steps of ours, from the stored file."""
     path = ROOT / "tests/results/td3_bc_on_d4rl.csv"
     lines = [x for x in path.read_text().splitlines() if not x.startswith("#")]
     rows = [row for row in csv.DictReader(lines) if row["task"] == "hopper-medium"]
     means = [float(row["mean"]) for row in rows]
     steps = range(10_000, 210_000, 10_000)
-    for seed, shift in enumerate((-1, 0, 1)):
-        scores = np.array(means[:20]) + 2 + shift
+    shifts = np.array([1, 2, 3])
+    for seed, shift in enumerate(shifts):
+        scores = np.array(means[:20]) + shift
         path = tmp_path / str(seed)
         make_run(path, "td3_bc", "hopper_medium", seed, scores, steps=steps)
+    drawn = catch_figures(monkeypatch)
     _, tables = report(tool, tmp_path, tmp_path / "report")
     (row,) = tables["TD3+BC here and on D4RL's files"]
     theirs, std = np.mean(means[:20]), float(rows[19]["average_std"])
     assert row["these runs"] == f"{theirs + 2:.1f} ± 1.0 (3; 200k)"
     assert row["on D4RL's files"] == f"{theirs:.1f} ± {std:.1f} (5)"
+    (panel,) = drawn["reproduction"]
+    (_, _, steps, theirs), (_, _, _, ours) = panel[2]
+    assert len(steps) > 20 and [x[0] for x in ours] == pytest.approx(means[0] + shifts)
+    assert [x[0] for x in theirs] == [float(rows[0][x]) for x in ("min", "mean", "max")]
     variances = np.array([1 / 3, std**2 / 5])
     freedom = variances.sum() ** 2 / (variances**2 / [2, 4]).sum()
     p = 2 * stats.t.sf(2 / math.sqrt(variances.sum()), freedom)
     assert row["p"] == f"{p:.2g}"
-    assert (tmp_path / "report/reproduction.png").exists()
 
 
 def test_the_published_curves_are_those_of_their_source():

@@ -14,6 +14,7 @@ from conftest import ROOT, wpc, write_hdf5
 
 sys.path.insert(0, str(ROOT / "tests/tools"))
 import check_physics
+import make_dataset
 import play_zoo
 
 EPISODES = ROOT.parent / "shared/d4rl/episodes"
@@ -166,6 +167,29 @@ def read_table(text):
 
 def read_counts(text):
     return [int(x) for x in re.findall(r"(\d+) rows compared, (\d+)", text)[0]]
+
+
+def test_check_physics_on_transitions_of_our_own(tmp_path, capsys):
+    """In D4RL's physics, one of them as if D4RL had clipped it, one wrong."""
+    names = ["observations", "actions", "rewards", "next_observations"]
+    names += ["terminals", "timeouts"]
+    columns, _ = make_dataset.play("hopper", None, 0, range(5))
+    data = dict(zip(names, columns, strict=True))
+    data["observations"][0, 8] = 10
+    rows = len(data["rewards"])
+    for key in ("", "next_observations"):
+        data.pop(key, None)
+        path = write_hdf5(tmp_path / "hopper.hdf5", data)
+        check(path)
+        text = capsys.readouterr().out
+        ours, stock = read_table(text).values()
+        assert read_counts(text) == [rows - 1, 1]
+        assert ours[1] < 1e-4 and ours[3] < 1e-4 and ours[4] == 0 and stock[1] > 0.01
+    data["rewards"][3] += 0.25
+    data["terminals"][1] ^= True
+    check(write_hdf5(path, data))
+    ours = read_table(capsys.readouterr().out)["D4RL's physics"]
+    assert ours[3] == pytest.approx(0.25, abs=0.01) and ours[4] == 1
 
 
 @needs_episodes

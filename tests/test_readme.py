@@ -6,15 +6,22 @@ After a change of wpc.py, this writes the lines of the README's map anew:
     python tests/test_readme.py
 """
 
+import importlib
+import json
 import re
+import shlex
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tyro
 
 ROOT = Path(__file__).parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests/tools")]
 README = (ROOT / "README.md").read_text()
+TABLES = (ROOT / "tests/results/tables.md").read_text()
 MAP_ROW = re.compile(r"^\| (.*) \| \[\d+\]\(wpc\.py#L\d+\) \|$", re.M)
 MAP = {  # what the paper has, and how the line of wpc.py begins that does it
     "networks, Table 4": "def mlp(input_dim, output_dim):",
@@ -65,12 +72,75 @@ def test_the_diff_is_part_of_the_real_one():
         assert change in real, change
 
 
-def test_its_scores_are_the_reports():
-    tables = (ROOT / "tests/results/tables.md").read_text()
-    scores = re.findall(r"\d+\.\d ± \d+\.\d", README)
-    assert len(scores) >= 8
-    for score in scores:
-        assert re.search(rf"(?<![\d.]){re.escape(score)}(?![\d.])", tables), score
+def rows_of(text, title):
+    """The cells of the rows on D4RL's tasks in a section's table."""
+    section = text.split(f"## {title}\n")[1].split("\n## ")[0]
+    lines = re.findall(r"^\| [a-z0-9]+-medium.*", section, re.M)
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+
+
+def test_its_results_are_the_reports():
+    ours, theirs = rows_of(README, "Results"), rows_of(TABLES, "Table 1")
+    assert len(ours) == len(theirs)
+    for row, cells in zip(ours, theirs, strict=True):
+        cells = ["" if x == "-" else re.sub(r"; [\d,]+k\)", ")", x) for x in cells]
+        assert [x.strip("*") for x in row] == cells[: len(row)]
+    cells = {row[0]: [x.split(" (")[0] for x in row] for row in theirs}
+    wpc, wpc_paper, td3_bc, td3_bc_paper = cells["hopper-medium"][2:6]
+    assert f"wPC has {wpc} (three seeds; the paper {wpc_paper})" in README
+    assert f"and TD3+BC {td3_bc} (two; {td3_bc_paper}), on" in README
+    wpc, wpc_paper, td3_bc, td3_bc_paper = cells["walker2d-medium"][2:6]
+    assert f" {wpc} ({wpc_paper}) and {td3_bc} ({td3_bc_paper}), where" in README
+
+
+def test_its_differences_are_the_reports():
+    rows = {task: cell for task, cell, _ in rows_of(TABLES, "Differences")}
+    pattern = r"(\S+) \[(\S+), (\S+)\], p = (\S+)"
+    mean, low, high, p = re.match(pattern, rows["hopper-medium"]).groups()
+    assert f"is {mean} (95% interval {low} to {high}, p = {float(p):.1g}, W" in README
+    mean, low, high, p = re.match(pattern, rows["walker2d-medium"]).groups()
+    assert f"it is {mean} ({low} to {high}, p = {p})" in README
+    assert f"where the lead could be chance (p = {p})" in README
+
+
+def arguments(script, words):
+    return vars(tyro.cli(importlib.import_module(Path(script).stem).Args, args=words))
+
+
+def test_the_runs_have_the_arguments_of_their_commands():
+    text = (ROOT / "tests/results/commands.txt").read_text()
+    folders = []
+    for line in re.findall(
+        r"^python (?:tests/tools/compiled.py )?(\w+\.py .*)", text, re.M
+    ):
+        script, *words = shlex.split(line)
+        args = arguments(script, words)
+        folders.append(ROOT / "tests/results" / args["run_dir"])
+        made = json.loads((folders[-1] / "args.json").read_text())
+        args |= {"device": made["device"], "dataset": Path(args["dataset"]).name}
+        assert made == made | args
+    assert sorted(folders) == sorted((ROOT / "tests/results/runs").iterdir())
+
+
+COMMANDS = re.findall(r"(?<=\.venv/bin/python )[a-z0-9_/]+\.py [^\n`]+", README)
+
+
+@pytest.mark.parametrize("line", [x for x in COMMANDS if "[...]" not in x])
+def test_its_commands_are_understood(line):
+    script, *words = shlex.split(line.removesuffix(" ..."))
+    if script == "tests/tools/compiled.py":
+        script, *words = words
+    if script == "tests/tools/experiments.py":
+        assert words[0] == "report" and words[1::2] == ["--runs", "--out"]
+    else:
+        arguments(script, words)
+
+
+def test_its_program_plays_a_run(finished):
+    (program,) = re.findall(r"```python\n(.*?)```", README, re.S)
+    names = {}
+    exec(program.replace("RUN_DIR", str(finished)), names)
+    assert names["observations"].shape == (1, 17) and names["rewards"].shape == (1,)
 
 
 def tables(script, task):
@@ -121,8 +191,7 @@ def test_what_it_says_of_q_running_away_is_in_the_runs():
 
 
 def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
-    text = (ROOT / "tests/results/tables.md").read_text()
-    table = text.split("## Table 1")[1].split("##")[0].splitlines()
+    table = TABLES.split("## Table 1")[1].split("##")[0].splitlines()
     header, *rows = [line.split("|")[1:-1] for line in table if line.startswith("| ")]
     count = 0
     for row in rows:
@@ -137,14 +206,19 @@ def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
 
 
 def test_td3_bc_is_as_near_to_its_curves_on_d4rls_files_as_it_says():
-    text = (ROOT / "tests/results/tables.md").read_text()
-    table = text.split("## TD3+BC here and on D4RL's files")[1].splitlines()
-    rows = [line.split("|")[1:-1] for line in table if "-medium |" in line]
+    rows = rows_of(TABLES, "TD3+BC here and on D4RL's files")
+    rows = [row for row in rows if row[0].endswith("-medium")]
     assert len(rows) == 3
     for _, ours, theirs, _ in rows:
         assert abs(float(ours.split()[0]) - float(theirs.split()[0])) <= 0.3 + 1e-9
     assert "TD3+BC's mean over all evaluations is within 0.3 points of" in README
-    assert "p = {}, {} and {}".format(*(row[3].strip() for row in rows)) in README
+    assert "p = {}, {} and {}".format(*(row[3] for row in rows)) in README
+    below = [
+        float(theirs.split()[0]) - float(ours.split()[0])
+        for task, ours, theirs, _ in rows_of(TABLES, "TD3+BC here and on D4RL's files")
+        if task.endswith("-medium-replay")
+    ]
+    assert "it is {:.0f} and {:.0f} points below".format(*below) in README
 
 
 def prose(text):

@@ -6,6 +6,8 @@ import importlib
 import json
 import shlex
 import sys
+from concurrent.futures import Future
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -19,6 +21,7 @@ together = importlib.import_module("together")
 SMALL, LARGE = (5, 2, 1.0), (7, 3, 1.0)
 OPTIONS = {"device": "cpu", "policy_noise": 0.0, "batch_size": 16}
 # Without noise, which is drawn for all runs together.
+OPTIONS |= {"discount": 0.9, "tau": 0.1, "actor_lr": 1e-3, "critic_lr": 1e-4}
 OPTIONS |= {"value_lr": 1e-3, "beta": 0.5}  # of the scripts that have them
 RUNS = [
     (td3_bc, SMALL, {"alpha": 1.0}),
@@ -55,9 +58,12 @@ def make_dataset(dims, rows=100):
 
 def make_runs():
     torch.manual_seed(0)
-    datasets = {dims: make_dataset(dims) for dims in (SMALL, LARGE)}
+    datasets = {SMALL: make_dataset(SMALL), LARGE: make_dataset(LARGE, rows=150)}
     all_dims = [dims for _, dims, _ in RUNS]
-    data = [(datasets[dims], None, None, 0.0) for dims in all_dims]
+    data = [  # mean, std and best return tell the runs apart
+        (datasets[dims], torch.tensor(i), torch.tensor(1), float(i))
+        for i, dims in enumerate(all_dims)
+    ]
     args = []
     for script, _, options in RUNS:
         own = {k: v for k, v in OPTIONS.items() if hasattr(script.Args, k)}
@@ -99,6 +105,57 @@ def test_each_run_is_trained_as_by_its_script(float64):
                 getattr(runs.agent, network).net.copy_to(row, net)
             for key, tensor in getattr(single, network).state_dict().items():
                 torch.testing.assert_close(critic.state_dict()[key], tensor)
+
+
+def test_each_run_samples_its_own_rows(float64):
+    runs = make_runs()
+    rewards = torch.cat([runs.sample()["rewards"] for _ in range(100)], dim=1)
+    for ours, (dataset, *_) in zip(rewards, runs.data, strict=True):
+        assert set(ours.flatten().tolist()) == set(
+            dataset["rewards"].flatten().tolist()
+        )
+
+
+def test_each_run_is_evaluated_by_itself(float64):
+    """With its own policy, normalization and metrics."""
+    runs = make_runs()
+    runs.two_steps()
+    for i, ((args, dims, actor, mean, _), row) in enumerate(runs.snapshot()):
+        assert (args, dims, mean) == (runs.runs[i], RUNS[i][1], i)
+        runs.agent.actor.net.copy_to(i, runs.actors[i].net)
+        for key, tensor in runs.actors[i].state_dict().items():
+            assert np.array_equal(actor[key], tensor), key
+        assert row["best_discounted_return"] == i
+        assert row["q"] == runs.metrics["q"].flatten()[i]
+
+
+class Pool:
+    """Evaluates at once, in this process."""
+
+    def submit(self, function, *job):
+        future = Future()
+        future.set_result(function(*job))
+        return future
+
+
+@pytest.mark.parametrize("seconds, last", [(float("inf"), 60), (0, 20)])
+def test_a_row_is_of_as_many_steps_as_it_says(
+    float64, monkeypatch, tmp_path, seconds, last
+):
+    """The first run is of 60 steps, the others of 20; --seconds ends all of them."""
+    runs, done = make_runs(), []
+    for i, args in enumerate(runs.runs):
+        args.eval_freq, args.max_timesteps = 20, 20 if i else 60
+        args.run_dir = str(tmp_path / str(i))
+    monkeypatch.setattr(runs, "compile", lambda _: done.append(2))
+    monkeypatch.setattr(runs, "do", done.append)
+    monkeypatch.setattr(together, "evaluate_run", lambda *_: {"mean_return": sum(done)})
+    options = together.Options(Path("none"), seconds, device="cpu", compile=False)
+    together.train(runs, options, Pool(), {})
+    for i, end in enumerate([last, *[20] * (len(RUNS) - 1)]):
+        rows = csv.DictReader((tmp_path / str(i) / "evaluations.csv").open())
+        steps = [(int(row["step"]), float(row["mean_return"])) for row in rows]
+        assert steps == [(step, step) for step in range(0, end + 1, 20)]
 
 
 def test_the_traced_steps_are_the_steps(float64):
@@ -144,16 +201,21 @@ def test_a_run_that_is_there_is_not_written_over(tmp_path):
 
 
 def test_environments_of_gymnasium(tmp_path):
-    widths = {"observations": 3, "actions": 1, "rewards": 1, "terminals": 1}
-    path = tmp_path / "data.hdf5"
-    with h5py.File(path, "w") as file:
-        for name, width in (widths | {"timeouts": 1}).items():
-            file[name] = np.zeros((30, width), np.float32)
-    args = [wpc.Args("Pendulum-v1", str(path), seed=seed) for seed in (0, 1)]
-    runs = together.load(args, "cpu")
-    assert runs.dims == [(3, 1, 2.0)] * 2
-    for job, _ in runs.snapshot():
-        assert together.evaluate_run(*job)["mean_return"] < 0
+    def args(env, state_dim):
+        path = tmp_path / f"{env}.hdf5"
+        with h5py.File(path, "w") as file:
+            for name in ("actions", "rewards", "terminals", "timeouts"):
+                file[name] = np.zeros((30, 1), np.float32)
+            file["observations"] = np.zeros((30, state_dim), np.float32)
+        return wpc.Args(env, str(path))
+
+    pendulum = args("Pendulum-v1", 3)
+    runs = together.load([pendulum], "cpu")
+    assert runs.dims == [(3, 1, 2.0)]
+    ((job, _),) = runs.snapshot()
+    assert together.evaluate_run(*job)["mean_return"] < 0
+    with pytest.raises(SystemExit, match="the same bounds"):
+        together.load([pendulum, args("MountainCarContinuous-v0", 2)], "cpu")
 
 
 def test_the_random_weight_is_permuted_within_each_run():

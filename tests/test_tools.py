@@ -4,7 +4,7 @@ check_steps.py.
 
 tests/data/minari holds datasets that Minari's own DataCollector made (see
 tests/tools/make_minari_data.py): some episodes of Hopper-v5 end and some are cut off,
-all of Pendulum-v1's are cut off, and CartPole-v1's actions are discrete.
+all of Pendulum-v1's are cut off.
 """
 
 import re
@@ -177,6 +177,55 @@ def test_the_file_is_cut_off_at_its_last_step(tmp_path, capsys):
     expected += f"{np.max(returns):.1f}; D4RL's score {score:.1f}"
     assert expected in output
     run_printed_command(output, tmp_path / "run")
+
+
+class Delayed(gym.Env):
+    """Episodes of two steps; the first action is paid for by the second step."""
+
+    observation_space, action_space = Box(-2, 2, (2,)), Box(-2, 2, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.first = None
+        return np.array([self.np_random.normal(), 0]), {}
+
+    def step(self, action):
+        if self.first is None:
+            self.first = action[0]
+            return np.array([self.first, 1]), 0.0, False, False, {}
+        return np.array([9, 9]), -((self.first - 1.5) ** 2), True, False, {}
+
+
+def learn(steps, seed=0, **options):
+    """What SAC meets in this environment, and each step's last return."""
+    args = make_dataset.Args("Delayed", steps, Path("unused"), seed=seed, **options)
+    data = {
+        "observations": np.zeros((steps, 2), np.float32),
+        "actions": np.zeros((steps, 1), np.float32),
+        "rewards": np.zeros(steps, np.float32),
+        "next_observations": np.zeros((steps, 2), np.float32),
+        "terminals": np.zeros(steps, bool),
+        "timeouts": np.zeros(steps, bool),
+    }
+    returns = [last for _, last in make_dataset.learn(args, Delayed(), data)]
+    return data, returns
+
+
+def test_sac_learns():
+    """To begin with 1.5, which pays best, where uniform actions average 0."""
+    data, returns = learn(400, random_steps=80, lr=3e-3, tau=0.05, batch_size=64)
+    space = Box(-2, 2, (1,), seed=0)
+    assert data["actions"][:80].tolist() == [space.sample() for _ in range(80)]
+    assert data["actions"][80] != space.sample()
+    assert data["actions"][::2][-50:].mean() == pytest.approx(1.5, abs=0.4)
+    assert returns[-1] == data["rewards"][-1]
+
+
+def test_the_seed_is_that_of_states_and_actions():
+    ours, same, other = (learn(12, seed, random_steps=8)[0] for seed in (0, 0, 1))
+    assert all(np.array_equal(ours[key], same[key]) for key in ours)
+    assert (ours["actions"] != other["actions"]).all()
+    assert (ours["observations"][::2] != other["observations"][::2]).any()
 
 
 def test_what_sac_met_is_written(tmp_path):
@@ -593,6 +642,14 @@ def save_run(folder, env, state_dim, action_dim, max_action=1.0):
     return actor, mean, std
 
 
+def test_films_are_in_d4rls_physics():
+    """As far as it can be seen without a picture."""
+    film, ours = play.make_env("hopper"), wpc.make_envs("hopper", 1).envs[0]
+    for name in ("body_mass", "body_inertia", "geom_margin"):
+        film_s, ours_s = (getattr(env.unwrapped.model, name) for env in (film, ours))
+        assert np.array_equal(film_s, ours_s)
+
+
 @pytest.fixture
 def hopper_run(tmp_path, monkeypatch):
     """A run folder, its policy, mean and std, where Hopper can be filmed."""
@@ -698,7 +755,10 @@ def test_films_of_what_is_no_run(tmp_path):
 # check_steps.py
 
 PEER = """
+import copy
 import sys
+
+import torch
 
 sys.path.insert(0, {root!r})
 import {script} as script
@@ -719,7 +779,12 @@ class TD3_BC:
         batch["terminals"] = 1 - batch["terminals"]
         for name in ("actor_target", "critic_target"):
             setattr(self.agent, name, getattr(self, name))
+        if {v_before}:
+            value, old = self.value, copy.deepcopy(self.value)
+            self.agent.value = lambda s: (value if torch.is_grad_enabled() else old)(s)
         self.agent.update(batch, self.steps)
+        if {moved!r}:
+            next(getattr(self, {moved!r}).parameters()).data += 1e-3
 """
 
 
@@ -731,10 +796,13 @@ def float64():
 
 @pytest.mark.parametrize("name", ["td3_bc", "wpc"])
 def test_steps_are_compared_with_another_file_s(tmp_path, capsys, float64, name):
-    """With a file that does the same, and with one whose discount is another."""
+    """With a file that does the same, with one that takes V from before its update, and
+    with some that do something else."""
 
-    def differences(options):
-        text = PEER.format(root=str(ROOT), script=name, options=options)
+    def differences(options, v_before=False, moved=""):
+        text = PEER.format(
+            root=str(ROOT), script=name, options=options, v_before=v_before, moved=moved
+        )
         (tmp_path / "peer.py").write_text(text)
         check_steps.main(check_steps.Args([tmp_path / "peer.py"], steps=4))
         lines = capsys.readouterr().out.splitlines()
@@ -745,6 +813,14 @@ def test_steps_are_compared_with_another_file_s(tmp_path, capsys, float64, name)
     assert same == 0
     assert len(v_before) == (name == "wpc")
     assert min(v_before + differences({"discount": 0.98})) > 1e-6
+    networks = ["actor", "critic", "actor_target", "critic_target"]
+    if name == "wpc":
+        v_after, v_before = differences({}, v_before=True)
+        assert v_after > 1e-6 and v_before == 0
+        networks.append("value")
+    for network in networks:
+        assert min(differences({}, moved=network)) > 5e-4
+    assert torch.get_default_dtype() == torch.float64
 
 
 def test_what_is_no_file_of_td3_bc(tmp_path, float64):

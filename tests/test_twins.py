@@ -83,6 +83,8 @@ def test_a_function_fits_on_a_screen_and_the_algorithm_in_the_first_half(name):
 def test_the_diff_is_short():
     changed = [line for line in real_diff("td3_bc", "wpc") if line[0] in "<>"]
     assert len(changed) <= DIFF
+    readme = (ROOT / "README.md").read_text()
+    assert f"shows all that wPC adds, in {len(changed)} lines" in readme
 
 
 @pytest.mark.parametrize("action", [["check"], ["format", "--check"]])

@@ -31,4 +31,3 @@ if __name__ == "__main__":
     # Some of Hopper's episodes end and some are cut off; all of Pendulum's are cut off.
     collect("Hopper-v5", "test/hopper-v0", episodes=8, steps=25, **REFERENCES)
     collect("Pendulum-v1", "test/pendulum-v0", episodes=2, steps=20)
-    collect("CartPole-v1", "test/cartpole-v0", episodes=1, steps=5)
