@@ -13,6 +13,7 @@ import sys
 import warnings
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import h5py
@@ -177,6 +178,19 @@ def test_the_file_is_cut_off_at_its_last_step(tmp_path, capsys):
     expected += f"{np.max(returns):.1f}; D4RL's score {score:.1f}"
     assert expected in output
     run_printed_command(output, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    "options, sentence",
+    [
+        ({"steps": 0}, "must be >= 1"),
+        ({"workers": 0}, "must be >= 1"),
+        ({"policy": Path("policy.npz"), "random": True}, "exclude each other"),
+    ],
+)
+def test_options_of_make_dataset_that_can_not_be(options, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        make_dataset.Args(**{"env": "hopper", "steps": 9, "out": Path("x")} | options)
 
 
 class Delayed(gym.Env):
@@ -616,6 +630,12 @@ def test_an_empty_dataset(tmp_path, make):
     assert refusal_of(from_minari.main, args) == "test/made-v0 is empty"
 
 
+def test_a_dataset_is_downloaded(monkeypatch):
+    monkeypatch.setattr(minari, "load_dataset", lambda name, download: (name, download))
+    name = "mujoco/hopper/medium-v0"
+    assert from_minari.open_dataset(name) == (name, True)
+
+
 @pytest.mark.parametrize("name", [str(ROOT / "tests"), "nonsense"])
 def test_what_is_no_dataset_of_minaris(tmp_path, name):
     args = from_minari.Args(name, tmp_path / "data.hdf5")
@@ -717,6 +737,42 @@ def test_a_missing_graphics_library(tmp_path):
         patch.setenv("PYOPENGL_PLATFORM", "egl")  # which contradicts that
         process = run(sys.executable, *line)
     assert_one_sentence(process, "MuJoCo needs EGL or OSMesa (on Debian, apt install")
+
+
+def film(tmp_path, monkeypatch, name):
+    """play.py's main with an environment of three steps, whose pictures are grey."""
+
+    class Grey(Delayed):
+        spec = SimpleNamespace(max_episode_steps=3)
+
+        def render(self):
+            return np.full((4, 4, 3), 99, np.uint8)
+
+    save_run(tmp_path, "Grey-v0", 2, 1)
+    observation, _ = (env := Grey()).reset()
+    monkeypatch.setattr(play, "start", lambda *_: (env, observation))
+    play.main(play.Args(tmp_path, tmp_path / name, size=16))
+
+
+def test_an_mp4(tmp_path, monkeypatch):
+    monkeypatch.setattr(play.importlib.util, "find_spec", lambda name: name)
+    films = []
+
+    def write(path, pictures, fps):
+        films.append((path, np.shape(pictures), fps))
+
+    monkeypatch.setattr(play.imageio, "mimsave", write)
+    film(tmp_path, monkeypatch, "policy.mp4")
+    assert films == [(tmp_path / "policy.mp4", (2, 16, 16, 3), 30)]
+
+
+def test_a_full_disk_while_a_film_is_written(tmp_path, monkeypatch):
+    def save(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", save)
+    with pytest.raises(SystemExit, match=r"policy.gif can't be written: \[Errno 28\]"):
+        film(tmp_path, monkeypatch, "policy.gif")
 
 
 NO_FILM = [
