@@ -88,7 +88,7 @@ def test_its_results_are_the_reports():
     cells = {row[0]: [x.split(" (")[0] for x in row] for row in theirs}
     wpc, wpc_paper, td3_bc, td3_bc_paper = cells["hopper-medium"][2:6]
     assert f"wPC has {wpc} (three seeds; the paper {wpc_paper})" in README
-    assert f"and TD3+BC {td3_bc} (two; {td3_bc_paper}), on" in README
+    assert f"and TD3+BC {td3_bc} ({td3_bc_paper}), on" in README
     wpc, wpc_paper, td3_bc, td3_bc_paper = cells["walker2d-medium"][2:6]
     assert f" {wpc} ({wpc_paper}) and {td3_bc} ({td3_bc_paper}), where" in README
 
@@ -210,8 +210,8 @@ def test_td3_bc_is_as_near_to_its_curves_on_d4rls_files_as_it_says():
     rows = [row for row in rows if row[0].endswith("-medium")]
     assert len(rows) == 3
     for _, ours, theirs, _ in rows:
-        assert abs(float(ours.split()[0]) - float(theirs.split()[0])) <= 0.3 + 1e-9
-    assert "TD3+BC's mean over all evaluations is within 0.3 points of" in README
+        assert abs(float(ours.split()[0]) - float(theirs.split()[0])) <= 1
+    assert "TD3+BC's mean over all evaluations is within a point of" in README
     assert "p = {}, {} and {}".format(*(row[3] for row in rows)) in README
     below = [
         float(theirs.split()[0]) - float(ours.split()[0])
