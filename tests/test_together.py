@@ -35,13 +35,19 @@ RUNS = [
 ]
 
 
+@pytest.fixture(autouse=True)
+def other_weight():
+    """Of wpc.py, which together.py replaces."""
+    ours = wpc.other_weight
+    yield
+    wpc.other_weight = ours
+
+
 @pytest.fixture
 def float64():
     torch.set_default_dtype(torch.float64)
-    other_weight = wpc.other_weight
     yield
     torch.set_default_dtype(torch.float32)
-    wpc.other_weight = other_weight
 
 
 def make_dataset(dims, rows=100):
