@@ -189,6 +189,7 @@ def test_the_traced_steps_are_the_steps(float64):
         (["wpc.py", "td3_bc.py --eval-freq 10"], "the same eval_freq"),
         (["wpc.py --policy-freq 1"], "runs with policy_freq 2"),
         (["wpc.py --eval-freq 15"], "an eval_freq that 10 divides"),
+        (["wpc.py", "wbc.py --max-timesteps 7777"], "must divide each run's max_ti"),
         ([], "must have runs"),
     ],
 )

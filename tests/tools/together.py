@@ -406,6 +406,8 @@ def read_commands(path):
             f"{path} must have runs with policy_freq 2 and an eval_freq that {CYCLE} "
             "divides"
         )
+    if any(args.max_timesteps % args.eval_freq for args in runs):
+        sys.exit(f"{path}: eval_freq must divide each run's max_timesteps")
     return runs
 
 
