@@ -212,7 +212,9 @@ def test_td3_bc_is_as_near_to_its_curves_on_d4rls_files_as_it_says():
     for _, ours, theirs, _ in rows:
         assert abs(float(ours.split()[0]) - float(theirs.split()[0])) <= 1
     assert "TD3+BC's mean over all evaluations is within a point of" in README
-    assert "p = {}, {} and {}".format(*(row[3] for row in rows)) in README
+    sentence = "p = {} with two of our seeds, {} and {} with three"
+    assert sentence.format(*(row[3] for row in rows)) in README
+    assert [row[1].split("(")[1][0] for row in rows] == ["2", "3", "3"]
     below = [
         float(theirs.split()[0]) - float(ours.split()[0])
         for task, ours, theirs, _ in rows_of(TABLES, "TD3+BC here and on D4RL's files")

@@ -613,8 +613,8 @@ def test_the_environment_must_be_the_recorded_one(
     args = from_minari.Args(name, out, env)
     if sentence is None:
         from_minari.main(args)
-        command = f"wpc.py --env {env or 'Pendulum-v1'} --dataset {out}"
-        command = f"{sys.orig_argv[0]} {command}"
+        command = f"{sys.orig_argv[0]} wpc.py --env {env or 'Pendulum-v1'}"
+        command += f" --dataset {out}"
         assert capsys.readouterr().out.endswith(f"to train: {command}\n")
     else:
         assert sentence in refusal_of(from_minari.main, args)
@@ -664,10 +664,10 @@ def save_run(folder, env, state_dim, action_dim, max_action=1.0):
 
 def test_films_are_in_d4rls_physics():
     """As far as it can be seen without a picture."""
-    film, ours = play.make_env("hopper"), wpc.make_envs("hopper", 1).envs[0]
+    filmed = play.make_env("hopper").unwrapped.model
+    evaluated = wpc.make_envs("hopper", 1).envs[0].unwrapped.model
     for name in ("body_mass", "body_inertia", "geom_margin"):
-        film_s, ours_s = (getattr(env.unwrapped.model, name) for env in (film, ours))
-        assert np.array_equal(film_s, ours_s)
+        assert np.array_equal(getattr(filmed, name), getattr(evaluated, name))
 
 
 @pytest.fixture
