@@ -92,7 +92,7 @@ class Args:
         if not (0 <= self.discount <= 1 and 0 <= self.tau <= 1):
             raise ValueError("discount and tau must be between 0 and 1")
         if not (self.dataset or d4rl_robot(self.env)):
-            raise ValueError(f"{self.env} is not a D4RL task: it needs --dataset")
+            raise ValueError(f"{self.env} can't be downloaded: it needs --dataset")
 
 
 # --- Networks -------------------------------------------------------------------------
@@ -302,7 +302,7 @@ def evaluate(envs, actor, mean, std, args):
 
     Returns the mean and deviation of the returns and, on D4RL's robots, the score.
     """
-    # Runs of different seeds share no start: environment i is seeded with this plus i.
+    # The same starts at each evaluation, shared by no two seeds: environment i adds i.
     observations, _ = envs.reset(seed=1000 * (args.seed + 100))
     returns = np.zeros(envs.num_envs)
     running = np.full(envs.num_envs, True)
@@ -351,9 +351,9 @@ def download_dataset(task):
 def load_dataset(path, state_dim, action_dim, max_action, args):
     """The transitions of an HDF5 file in D4RL's format, as in d4rl.qlearning_dataset.
 
-    Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]), or with the
-    file's own next_observations[i]. The last row gives none, nor does a row with a
-    timeout, whose o[i + 1] is in the next episode; d4rl drops both in either case.
+    Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]); where the file
+    has next_observations, which d4rl ignores, these replace o[i + 1]. As in d4rl, rows
+    with a timeout, whose o[i + 1] is in the next episode, and the last row give none.
 
     Returns them by name, float32 tensors (N, width) with normalized states; the mean
     and std, each (state_dim,), that normalize them; and the rows' best discounted
@@ -429,9 +429,9 @@ def write_file(path, content):
 def save(run_dir, checkpoint):
     """Writes checkpoint.pt and, from the evaluations in it, evaluations.csv."""
     content, table = io.BytesIO(), io.StringIO()
-    torch.save(checkpoint, content)  # to memory first, as a full disk breaks torch.save
+    torch.save(checkpoint, content)  # in memory: on a full disk it raises no OSError
     write_file(run_dir / "checkpoint.pt", content.getvalue())
-    rows = checkpoint["evaluations"]  # at step 0 there are no losses yet
+    rows = checkpoint["evaluations"]  # the first, at step 0, has no losses
     writer = csv.DictWriter(table, max(rows, key=len), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
@@ -462,7 +462,7 @@ def train(args):
         pairs = checkpoint["args"].items() ^ asdict(args).items()  # what differs
         changed = dict(pairs).keys() - {"max_timesteps", "device", "dataset", "run_dir"}
         if changed:
-            sys.exit(f"{run_dir} was run with another {' and '.join(changed)}")
+            sys.exit(f"{run_dir} had another script or {' and '.join(changed)}")
         for name, state in checkpoint["agent"].items():
             getattr(agent, name).load_state_dict(state)
         torch.set_rng_state(checkpoint["rng_state"])

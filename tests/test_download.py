@@ -106,7 +106,7 @@ def test_no_server_is_asked_for_other_names(monkeypatch, capsys, name):
     with pytest.raises(SystemExit) as stop:
         wpc.main()
     assert stop.value.code == 2
-    assert f"{name} is not a D4RL task: it needs --dataset" in capsys.readouterr().err
+    assert f"{name} can't be downloaded: it needs --dataset" in capsys.readouterr().err
 
 
 def test_names_and_digests_are_d4rls(monkeypatch, tmp_path):

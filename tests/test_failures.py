@@ -53,10 +53,10 @@ OUT_OF_BOUNDS = {
         {"tau": 1.5},
         {"tau": -0.5},
     ],
-    "HalfCheetah-v4 is not a D4RL task: it needs --dataset": [
+    "HalfCheetah-v4 can't be downloaded: it needs --dataset": [
         {"env": "HalfCheetah-v4"}
     ],
-    "ant-medium-v2 is not a D4RL task: it needs --dataset": [{"env": "ant-medium-v2"}],
+    "ant-medium-v2 can't be downloaded: it needs --dataset": [{"env": "ant-medium-v2"}],
 }
 CASES = [(options, text) for text, cases in OUT_OF_BOUNDS.items() for options in cases]
 
@@ -75,7 +75,7 @@ def test_the_bounds_themselves_are_fine(script):
 def test_a_mistake_ends_the_process_with_that_sentence(tmp_path):
     """tyro puts it into a box."""
     process = run(*command("wpc")[:2], "--env", "ant-medium-v2", cwd=tmp_path)
-    assert "ant-medium-v2 is not a D4RL task: it needs --dataset" in process.stderr
+    assert "ant-medium-v2 can't be downloaded: it needs --dataset" in process.stderr
     assert process.returncode == 2 and "Traceback" not in process.stderr
     assert list(tmp_path.iterdir()) == []
 

@@ -178,7 +178,7 @@ def test_what_it_says_of_q_running_away_is_in_the_runs():
     largest = sorted(f"{ratio.max():.1f}" for ratio in ratios)
     steps = [x["step"][r.argmax()] for x, r in zip(runs, ratios, strict=True)]
     assert "it reached {}, {} and {} times the best".format(*largest) in README
-    assert f"by steps {min(steps):,.0f} to {max(steps):,.0f}" in README
+    assert f"at steps {min(steps):,.0f} to {max(steps):,.0f}" in README
 
     (long,) = (x for x, r in zip(runs, ratios, strict=True) if r.max() > 5)
     early = long["step"] <= 600_000

@@ -342,11 +342,11 @@ def test_a_run_of_a_gpu_goes_on_without_one(run_dir):
 
 
 CONTRADICTIONS = [
-    ("wpc", ["--seed", 1], "was run with another seed"),
-    ("wpc", ["--alpha", 1.0], "was run with another alpha"),
-    ("wpc", ["--batch-size", 32], "was run with another batch_size"),
-    ("td3_bc", [], "was run with another "),
-    ("wbc", [], "was run with another "),
+    ("wpc", ["--seed", 1], "had another script or seed"),
+    ("wpc", ["--alpha", 1.0], "had another script or alpha"),
+    ("wpc", ["--batch-size", 32], "had another script or batch_size"),
+    ("td3_bc", [], "had another script or "),
+    ("wbc", [], "had another script or "),
 ]
 
 

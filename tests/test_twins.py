@@ -84,7 +84,7 @@ def test_the_diff_is_short():
     changed = [line for line in real_diff("td3_bc", "wpc") if line[0] in "<>"]
     assert len(changed) <= DIFF
     readme = (ROOT / "README.md").read_text()
-    assert f"shows all that wPC adds, in {len(changed)} lines" in readme
+    assert f"shows all that wPC adds, in {len(changed)} changed lines" in readme
 
 
 @pytest.mark.parametrize("action", [["check"], ["format", "--check"]])
