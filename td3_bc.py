@@ -335,7 +335,8 @@ def load_dataset(path, state_dim, action_dim, max_action, args):
     and std, each (state_dim,), that normalize them; and the rows' best discounted
     return-to-go, to compare Q with. Exits with a sentence if the file doesn't fit.
     """
-    arrays, widths = {}, {"observations": state_dim, "actions": action_dim}
+    arrays = {}
+    widths = {"observations": state_dim, "actions": action_dim}
     widths |= {"rewards": 1, "terminals": 1, "timeouts": 1}
     try:
         with h5py.File(path) as file:
@@ -460,10 +461,10 @@ def train(args):
         if step % args.eval_freq and step < args.max_timesteps:
             continue
 
+        scalars = {k: x.item() for k, x in metrics.items()}  # a GPU finishes its steps
         speed = (step - clock_step) / (time.perf_counter() - clock)
-        row = {"step": step, **evaluate(envs, agent.actor, mean, std, args)}
+        row = {"step": step, **evaluate(envs, agent.actor, mean, std, args), **scalars}
         row |= {"steps_per_second": speed, "best_discounted_return": best_return}
-        row |= {name: metric.item() for name, metric in metrics.items()}
         if not np.isfinite(list(row.values())).all():
             sys.exit(f"diverged by step {step}: {row}; the last checkpoint is kept")
         evaluations.append(row)

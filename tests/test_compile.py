@@ -30,6 +30,7 @@ from conftest import (
     wbc,
     wpc,
 )
+from torch._inductor.exc import InductorError
 from torch.utils.flop_counter import FlopCounterMode
 
 sys.path.insert(0, str(ROOT / "tests/tools"))
@@ -125,6 +126,17 @@ def test_a_continued_adam_has_the_same_powers_of_its_betas():
     assert continued.beta2_power.item() != 0.999**5000
 
 
+@pytest.mark.parametrize("kind", ["Adam", "AdamW"])
+@pytest.mark.parametrize("option", ["weight_decay", "amsgrad", "maximize", "groups"])
+def test_another_adam_is_refused(kind, option):
+    parameters = torch.nn.Linear(2, 1).parameters()
+    if option == "groups":
+        parameters, option = [{"params": x} for x in parameters], "fused"
+    optimizer = getattr(torch.optim, kind)(parameters, **{option: True})
+    with pytest.raises(NotImplementedError):
+        compiled.TraceableAdam(optimizer)
+
+
 def compiled_command(*arguments):
     python, script, *flags = command("wpc", *arguments)
     return [python, str(ROOT / "tests/tools/compiled.py"), script, *flags]
@@ -199,6 +211,21 @@ def test_where_the_cache_cannot_be_written(monkeypatch, tmp_path):
     assert_one_sentence(process, "TORCHINDUCTOR_CACHE_DIR")
 
 
+def test_other_failures_of_the_compiler_keep_their_traceback(monkeypatch, tmp_path):
+    """Such as what it can't compile in an edited script."""
+    error = InductorError(ValueError("unheard of"), None)
+
+    def main():
+        raise error
+
+    script = types.SimpleNamespace(main=main)
+    monkeypatch.setattr(compiled, "install", lambda _: None)
+    monkeypatch.setattr(compiled.importlib, "import_module", lambda _: script)
+    monkeypatch.setattr(sys, "argv", ["compiled.py", str(ROOT / "wpc.py")])
+    with pytest.raises(InductorError, match="unheard of"):
+        compiled.main()
+
+
 @pytest.mark.parametrize("arguments", [[], ["nothing.py"]])
 def test_a_script_must_be_named(arguments):
     process = run(sys.executable, ROOT / "tests/tools/compiled.py", *arguments)
@@ -245,8 +272,6 @@ def test_what_a_script_does_otherwise(monkeypatch, script, device):
 
 class PretendGraph:
     """Does at each replay what was done while it was captured."""
-
-    capturing = None
 
     def replay(self):
         self.steps()
@@ -351,6 +376,19 @@ def test_the_bare_products_are_those_of_wpc():
     # The gradient of Q1's parameters of the policy's loss, which nothing needs
     unused = 2 * 256 * (14 * 256 + 256 * 256 + 256)
     assert products(bare, 2) == products(ours, 2) - unused
+
+
+def test_a_peer_is_measured_on_the_cpu(tmp_path):
+    """Where there is a GPU, the files choose it."""
+    (tmp_path / "peer.py").write_text(
+        "device = 'cuda'\n"
+        "class TD3_BC:\n"
+        "    def __init__(self, state_dim, action_dim, max_action):\n"
+        "        assert str(device) == 'cpu'\n"
+        "    def train(self, buffer, batch_size):\n"
+        "        assert len(buffer.sample(batch_size)) == 5\n"
+    )
+    assert benchmark.Steps(benchmark.peer_steps(tmp_path / "peer.py")).run(2) > 0
 
 
 def test_the_benchmarks_table(monkeypatch, capsys):

@@ -205,8 +205,8 @@ def test_a_run_on_another_environment(random_data, tmp_path):
     run_here(wpc, *line, "--run-dir", tmp_path / "run")
     rows = read_rows(tmp_path / "run")
     assert [row["step"] for row in rows] == ["0", "2", "4"]
-    columns = ["step", "mean_return", "std_return", "best_discounted_return", "q"]
-    assert list(rows[0])[:5] == columns and "normalized_score" not in rows[0]
+    columns = ["step", "mean_return", "std_return", "q"]
+    assert list(rows[0])[:4] == columns and "normalized_score" not in rows[0]
     curve = read_curves(tmp_path / "run")["mean_return"]
     assert [step for step, _ in curve] == [0, 2, 4]
 

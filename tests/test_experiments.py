@@ -262,6 +262,39 @@ def test_runs_that_are_of_no_use_are_passed_over(tool, tmp_path):
     assert len(lines) == len(bad) + 5 and "9 evaluations, ten are needed" in out
 
 
+def test_runs_on_different_data_are_no_seeds_of_one_system(tool, tmp_path):
+    for seed in (0, 1):
+        make_run(tmp_path / f"wpc{seed}", "wpc", "hopper_medium", seed, 10)
+        path = make_run(tmp_path / f"wbc{seed}", "wbc", "hopper_medium", seed, 10)
+        path /= "evaluations.csv"
+        path.write_text(path.read_text().replace("10.0,5.0\n", f"1{seed}.0,5.0\n"))
+    printed, tables = report(tool, tmp_path, tmp_path / "report")
+    (row,) = tables["Table 1"]
+    assert row["wPC"] == "10.0 ± 0.0 (2; 0.12k)" and row["wBC"] == "-"
+    assert "'wBC', '') (different data, with best returns 10.0 and 11.0)" in printed
+
+
+def test_q_is_drawn_where_returns_are_negative(tmp_path, monkeypatch):
+    scales, plain = [], experiments.plt.close
+    monkeypatch.setattr(
+        experiments.plt,
+        "close",
+        lambda figure: plain(scales.append(figure.axes[0].get_yscale()) or figure),
+    )
+    steps = np.arange(10)
+    for best, q in ((-0.3, -1.0), (0.3, 1.0), (0.3, 9.0)):
+        curve = "wPC", ("black", "-"), steps, np.full((3, 10), q)
+        draw = [("pendulum", "Q", [curve], [(best, "black", "--")])]
+        experiments.draw(tmp_path / "q.png", draw)
+    assert scales == ["linear", "linear", "log"]
+    groups = {}
+    for alpha in (1.0, 2.5):
+        key = "pendulum", "wPC", f"alpha {alpha}"
+        values = np.ones((2, 3, 10))
+        groups[key] = experiments.Group(*key, alpha, -0.3, steps, *values)
+    assert experiments.runaway_panels(groups) == []
+
+
 def test_what_is_kept_apart(tool, tmp_path):
     """Other arguments, weights of one's own, and returns that are no scores."""
     task, expert = "hopper_medium", "hopper_medium_expert"

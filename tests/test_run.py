@@ -66,7 +66,7 @@ def test_a_run_from_start_to_end(monkeypatch, capfd, tmp_path, name):
     assert run_dir.name.startswith(f"halfcheetah_replay__{name}__0__20")
 
     rows = read_rows(run_dir)
-    assert list(rows[0]) == ["step", *SCORES, "best_discounted_return", *METRICS[name]]
+    assert list(rows[0]) == ["step", *SCORES, *METRICS[name], "best_discounted_return"]
     assert [int(row["step"]) for row in rows] == [0, 30, 60]
     for row, line in zip(rows, lines[2:], strict=True):
         assert line.startswith(f"step {row['step']}: ")
@@ -166,6 +166,21 @@ def test_steps_per_second_are_of_training_alone(monkeypatch, tmp_path):
     rows = load(tmp_path)["evaluations"]
     assert [row["step"] for row in rows] == [0, 30, 40, 60]
     assert [row["steps_per_second"] for row in rows] == [0, 30, 10, 19]
+
+
+def test_steps_that_a_gpu_has_yet_to_do_are_waited_for(monkeypatch, tmp_path):
+    """They are done when a metric is read, which here takes ten seconds."""
+    clock = itertools.count()
+
+    def item():
+        return float([next(clock) for _ in range(10)][-1])
+
+    metrics = {"q": SimpleNamespace(item=item)}
+    monkeypatch.setattr(wpc.Agent, "update", lambda *_: metrics)
+    monkeypatch.setattr(wpc, "time", SimpleNamespace(perf_counter=clock.__next__))
+    run_here(wpc, *command("wpc", "--run-dir", tmp_path))
+    rows = load(tmp_path)["evaluations"]
+    assert [row["steps_per_second"] for row in rows] == [0, 30 / 11, 30 / 11]
 
 
 # Arguments

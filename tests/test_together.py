@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """tests/tools/together.py: runs that are trained as one are the scripts' runs."""
 
+import contextlib
 import csv
 import importlib
 import json
@@ -13,7 +14,8 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from conftest import DATASET, ROOT, run, td3_bc, wbc, wpc
+import tyro
+from conftest import DATASET, ROOT, assert_one_sentence, load, run, td3_bc, wbc, wpc
 
 sys.path.insert(0, str(ROOT / "tests/tools"))
 together = importlib.import_module("together")
@@ -158,6 +160,7 @@ def test_a_row_is_of_as_many_steps_as_it_says(
     monkeypatch.setattr(together, "evaluate_run", lambda *_: {"mean_return": sum(done)})
     options = together.Options(Path("none"), seconds, device="cpu", compile=False)
     together.train(runs, options, Pool(), {})
+    together.write_runs(runs, {})
     for i, end in enumerate([last, *[20] * (len(RUNS) - 1)]):
         rows = csv.DictReader((tmp_path / str(i) / "evaluations.csv").open())
         steps = [(int(row["step"]), float(row["mean_return"])) for row in rows]
@@ -191,6 +194,10 @@ def test_the_traced_steps_are_the_steps(float64):
         (["wpc.py --eval-freq 15"], "an eval_freq that 10 divides"),
         (["wpc.py", "wbc.py --max-timesteps 7777"], "must divide each run's max_ti"),
         ([], "must have runs"),
+        (["wpc.py --run-dir a", "wbc.py --run-dir a"], "a --run-dir of its own"),
+        (["wpc.py --alpha 1", "wpc.py --alpha 2"], "a --run-dir of its own"),
+        (["my_wpc.py"], 'must begin "python wpc.py", .*: python my_wpc.py'),
+        (["-u wpc.py"], "must begin"),
     ],
 )
 def test_runs_that_can_not_be_one_are_refused(tmp_path, lines, sentence):
@@ -198,6 +205,39 @@ def test_runs_that_can_not_be_one_are_refused(tmp_path, lines, sentence):
     path.write_text("\n".join(f"python {line}" for line in lines))
     with pytest.raises(SystemExit, match=sentence):
         together.read_commands(path)
+
+
+def test_comments_and_the_compiled_tool_are_passed_over(tmp_path):
+    tool = "python tests/tools/compiled.py td3_bc.py --run-dir b"
+    text = f"# two runs\n\npython wpc.py --run-dir a\n{tool}\n"
+    (tmp_path / "commands.txt").write_text(text)
+    runs = together.read_commands(tmp_path / "commands.txt")
+    assert [type(args) for args in runs] == [wpc.Args, td3_bc.Args]
+    assert [args.run_dir for args in runs] == ["a", "b"]
+
+
+def test_what_was_evaluated_is_kept(monkeypatch, tmp_path):
+    """Where training is stopped, here in the evaluation at step 20."""
+    flags = f"--env halfcheetah --dataset {DATASET} --device cpu --run-dir {tmp_path} "
+    flags += "--max-timesteps 40 --eval-freq 10"
+    (tmp_path / "commands.txt").write_text(f"python wpc.py {flags}")
+    returns = iter([1.0, 2.0])
+
+    def evaluate_run(*_):
+        for value in returns:
+            return {"mean_return": value}
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(together, "evaluate_run", evaluate_run)
+    context = contextlib.nullcontext(Pool())
+    monkeypatch.setattr(together, "ProcessPoolExecutor", lambda *_: context)
+    line = ["together.py", str(tmp_path / "commands.txt"), "--no-compile"]
+    monkeypatch.setattr(sys, "argv", [*line, "--device", "cpu"])
+    with pytest.raises(SystemExit, match="what was evaluated is kept"):
+        together.main()
+    rows = csv.DictReader((tmp_path / "evaluations.csv").open())
+    kept = [(row["step"], row["mean_return"]) for row in rows]
+    assert kept == [("0", "1.0"), ("10", "2.0")]
 
 
 def test_a_run_that_is_there_is_not_written_over(tmp_path):
@@ -266,3 +306,15 @@ def test_each_run_leaves_what_its_script_leaves(tmp_path):
     assert {"q", "v", "weight", "lmbda"} <= columns["wpc0"]
     assert "lmbda" in columns["td3_bc0"] and "v" not in columns["td3_bc0"]
     assert "weight" in columns["wbc1"] and "lmbda" not in columns["wbc1"]
+
+    # The policy is the one that was evaluated last, and no script starts anew there.
+    checkpoint = load(folder)
+    policy = [{k: x.numpy() for k, x in checkpoint["agent"]["actor"].items()}]
+    policy += [checkpoint["mean"].numpy(), checkpoint["std"].numpy()]
+    args = tyro.cli(wbc.Args, args=shlex.split(lines[-1])[2:])
+    score = together.evaluate_run(args, (17, 6, 1.0), *policy)
+    assert score["mean_return"] == pytest.approx(float(rows[-1]["mean_return"]))
+    before = (folder / "evaluations.csv").read_text()
+    process = run(sys.executable, *shlex.split(lines[-1])[1:], cwd=ROOT)
+    assert_one_sentence(process, "had another script or made_by")
+    assert (folder / "evaluations.csv").read_text() == before

@@ -78,7 +78,9 @@ class Buffer:
 
 def peer_steps(path):
     """The training step of a file that has the class TD3_BC."""
-    agent, buffer = load(path).TD3_BC(STATE_DIM, ACTION_DIM, 1.0), Buffer()
+    peer, buffer = load(path), Buffer()
+    peer.device = torch.device("cpu")  # as the scripts, also where there is a GPU
+    agent = peer.TD3_BC(STATE_DIM, ACTION_DIM, 1.0)
     return lambda i: agent.train(buffer, BATCH)
 
 

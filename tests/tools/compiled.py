@@ -7,7 +7,8 @@ Arguments, run folder and checkpoints are the script's, and a run may go on with
 tool or without it. On a CPU, `Agent.update` is compiled by torch.compile, which needs a
 C++ compiler and takes about a minute the first time; results agree with the script's
 but for rounding. On a GPU, sampling and update are captured as CUDA graphs, and results
-should be the same to the last bit.
+should be the same to the last bit. Scripts may be edited, but `update` must do the same
+in all steps that policy_freq divides, and the same in all others.
 """
 
 import copy
@@ -20,9 +21,6 @@ from pathlib import Path
 
 import torch
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-
-
 # --- CPU: torch.compile ---------------------------------------------------------------
 
 
@@ -30,7 +28,10 @@ class TraceableAdam:
     """Stands in for a torch.optim.Adam, on its state, where torch.compile traces it."""
 
     def __init__(self, optimizer, device="cpu"):
-        group = optimizer.param_groups[0]
+        group, *others = optimizer.param_groups
+        options = group["weight_decay"], group["amsgrad"], group["maximize"]
+        if type(optimizer) is not torch.optim.Adam or others or any(options):
+            raise NotImplementedError("compiled.py knows Adam as the scripts have it")
         self.parameters = group["params"]
         self.lr, self.betas, self.eps = group["lr"], group["betas"], group["eps"]
         self.states = [optimizer.state[parameter] for parameter in self.parameters]
@@ -157,6 +158,7 @@ def install(script):
         if agent not in steps and agent.args.device == "cuda":
             steps[agent] = Graphs(agent, update, sample_batch)
         elif agent not in steps:
+            print("the first steps are compiled, which may take a minute", flush=True)
             steps[agent] = compile_update(agent, update)
         return steps[agent](batch, step)
 
@@ -183,10 +185,13 @@ def main():
     script = importlib.import_module(Path(sys.argv[1]).stem)
     install(script)
     sys.argv = sys.argv[1:]
-    print("the first steps are compiled, which may take a minute", flush=True)
     try:
         script.main()
     except torch._dynamo.exc.BackendCompilerFailed as error:
+        inductor = torch._inductor.exc
+        expected = inductor.InvalidCxxCompiler, inductor.CppCompileError
+        if not isinstance(error.inner_exception, expected):
+            raise
         reason = str(error).split("\n")[0]
         sys.exit(
             f"{reason}: compiling needs a C++ compiler; python {sys.argv[0]} works"

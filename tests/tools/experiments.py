@@ -199,6 +199,11 @@ def read_groups(folder):
 
     for key in sorted(runs, key=in_order):
         seeds = [runs[key][seed] for seed in sorted(runs[key])]
+        data = {f"{run['best_discounted_return'][-1]:.1f}" for run in seeds}
+        if len(data) > 1:
+            best = " and ".join(sorted(data))
+            print(f"passed over: {key} (different data, with best returns {best})")
+            continue
         steps = sorted(set.intersection(*(set(run["step"]) for run in seeds)))
         longest = max(run["step"][-1] for run in seeds)
         if len(steps) < 10:
@@ -369,7 +374,8 @@ def runaway_panels(groups):
     """Q and scores of wPC with several alphas, or on parts of a dataset."""
     families = {}
     for group in groups.values():
-        if group.system == "wPC" and re.fullmatch(r"(alpha \S+)?", group.others):
+        of_alpha = group.system == "wPC" and re.fullmatch(r"(alpha \S+)?", group.others)
+        if of_alpha and group.best_return > 0:
             family = re.sub(r"-\d+k?$", "", group.task)
             families.setdefault(family, []).append(group)
     shown = itertools.chain(*(x for x in families.values() if len(x) > 1))
@@ -408,7 +414,7 @@ def draw(path, panels):
             (handle,) = axis.plot(steps / 1000, middle, linestyle=line, color=color)
             axis.fill_between(steps / 1000, low, high, color=color, alpha=0.2, lw=0)
             handles.setdefault(label, handle)
-            if ylabel.startswith("Q") and high.max() > 10 * levels[0][0]:
+            if ylabel.startswith("Q") and high.max() > 10 * levels[0][0] > 0:
                 axis.set_yscale("log")
         for level, color, line in levels:
             axis.axhline(level, color=color, linestyle=line, linewidth=1)

@@ -13,17 +13,19 @@ The step is traced, compiled by torch.compile and captured as a CUDA graph.
 Networks start as the script starts them with the run's seed. Batches and noise are
 drawn for all runs together, so a run is not the one that the script makes with the same
 seed, but one as likely. Each run leaves args.json and evaluations.csv, as its script
-does.
+does, and a checkpoint.pt with its policy, for play.py; it can't be continued.
 """
 
 import copy
 import csv
 import hashlib
 import importlib
+import io
 import itertools
 import json
 import multiprocessing
 import os
+import re
 import shlex
 import sys
 import time
@@ -216,7 +218,9 @@ class Runs:
 
     def __init__(self, runs, dims, data, device):
         self.runs, self.dims, self.data, self.device = runs, dims, data, device
-        self.rows, self.metrics, self.graph = [[] for _ in runs], {}, None
+        self.metrics, self.graph = {}, None
+        self.rows = [[] for _ in runs]  # of each run: (step, evaluation, other columns)
+        self.jobs = [None] * len(runs)  # of each run: what was evaluated last
         kinds, alphas = zip(*map(system, runs), strict=True)
         wpc.other_weight = weight_of_each_run(kinds, device)
 
@@ -278,6 +282,8 @@ class Runs:
 
     def sample(self):
         shape = (len(self.runs), self.agent.args.batch_size)
+        # torch.compile makes the numbers float32, with 24 random bits: of a million
+        # rows, some are then drawn 3% more often than others.
         uniform = torch.rand(shape, dtype=torch.float64, device=self.device)
         indices = self.start + (uniform * self.size).long()
         return {name: column[indices] for name, column in self.columns.items()}
@@ -392,12 +398,20 @@ def read_commands(path):
     Exits with a sentence if the runs can't be trained as one.
     """
     runs = []
+    pattern = r"python (?:tests/tools/compiled\.py )?(wpc|td3_bc|wbc)\.py\b(.*)"
     for line in path.read_text().splitlines():
-        _, file, *flags = shlex.split(line)
-        script = importlib.import_module(Path(file).stem)
-        runs.append(tyro.cli(script.Args, args=flags))
+        if not line.strip() or line.startswith("#"):
+            continue
+        command = re.fullmatch(pattern, line)
+        if not command:
+            sys.exit(f'{path}: a line must begin "python wpc.py", or likewise: {line}')
+        script, flags = command.groups()
+        args = importlib.import_module(script).Args
+        runs.append(tyro.cli(args, args=shlex.split(flags)))
         if Path(runs[-1].run_dir, "evaluations.csv").exists():
             sys.exit(f"{runs[-1].run_dir} holds a run already: name another --run-dir")
+    if len({args.run_dir for args in runs}) < len(runs):
+        sys.exit(f"{path}: each line must have a --run-dir of its own")
     for name in (*SHARED, "eval_freq"):
         if len({getattr(args, name) for args in runs if hasattr(args, name)}) > 1:
             sys.exit(f"{path}: all runs must have the same {name}")
@@ -433,17 +447,37 @@ def load(runs, device):
 
 
 def write_runs(runs, made_by):
-    """Writes args.json and evaluations.csv of every run, as far as it is evaluated."""
-    for args, rows in zip(runs.runs, runs.rows, strict=True):
-        done = [row for row in rows if "mean_return" in row]
+    """Writes what each run leaves, as far as it is evaluated."""
+    for args, rows, job in zip(runs.runs, runs.rows, runs.jobs, strict=True):
+        done = [
+            {"step": step} | future.result() | row
+            for step, future, row in rows
+            if future.done() and not future.exception()
+        ]
+        if not done:
+            continue
         folder = Path(args.run_dir)
         folder.mkdir(parents=True, exist_ok=True)
         record = json.dumps(asdict(args) | made_by, indent=2)
-        (folder / "args.json").write_text(record)
-        with open(folder / "evaluations.csv", "w", newline="") as file:
-            writer = csv.DictWriter(file, done[-1], lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(done)
+        wpc.write_file(folder / "args.json", record.encode())
+
+        table = io.StringIO()
+        writer = csv.DictWriter(table, done[-1], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(done)
+        wpc.write_file(folder / "evaluations.csv", table.getvalue().encode())
+
+        _, (*_, max_action), actor, mean, std = job
+        checkpoint = {
+            "args": asdict(args) | {"made_by": "together.py"},  # so no script goes on
+            "agent": {"actor": {k: torch.from_numpy(x) for k, x in actor.items()}},
+            "mean": torch.from_numpy(mean),
+            "std": torch.from_numpy(std),
+            "max_action": max_action,
+        }
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        wpc.write_file(folder / "checkpoint.pt", content.getvalue())
 
 
 def train(runs, options, pool, made_by):
@@ -451,18 +485,17 @@ def train(runs, options, pool, made_by):
     begin, waiting = time.perf_counter(), []
 
     def submit(step, speed):
-        snapshot = zip(runs.runs, runs.rows, runs.snapshot(), strict=True)
-        for args, rows, (job, row) in snapshot:
-            if step <= args.max_timesteps:
-                rows.append({"step": step})
+        for i, (job, row) in enumerate(runs.snapshot()):
+            if step <= runs.runs[i].max_timesteps:
+                waiting.append(pool.submit(evaluate_run, *job))
                 row["steps_per_second"] = speed
-                waiting.append((pool.submit(evaluate_run, *job), rows[-1], row))
+                runs.rows[i].append((step, waiting[-1], row))
+                runs.jobs[i] = job
 
-    def collect(most):
-        """Fills in evaluations until at most so many are waiting."""
+    def wait(most):
+        """Until at most so many evaluations are to come."""
         while len(waiting) > most:
-            future, row, rest = waiting.pop(0)
-            row |= future.result() | rest
+            waiting.pop(0).result()
 
     submit(0, 0.0)
     runs.compile(compile_fx if options.compile else lambda graph, inputs: graph)
@@ -470,7 +503,7 @@ def train(runs, options, pool, made_by):
     step = CYCLE
     if options.device == "cuda":
         runs.capture()
-    collect(0)
+    wait(0)
     write_runs(runs, made_by)
     print(f"compiled after {time.perf_counter() - begin:.0f} s", flush=True)
     eval_freq = runs.runs[0].eval_freq
@@ -495,10 +528,9 @@ def train(runs, options, pool, made_by):
             )
         if now - begin > options.seconds:
             break
-        collect(4 * len(runs.runs))
+        wait(4 * len(runs.runs))
         clock = time.perf_counter()
-    collect(0)
-    write_runs(runs, made_by)
+    wait(0)
 
 
 def main():
@@ -517,7 +549,12 @@ def main():
     print(f"{len(runs.runs)} runs on {made_by['trained_on']}", flush=True)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(options.workers, context) as pool:
-        train(runs, options, pool, made_by)
+        try:
+            train(runs, options, pool, made_by)
+        except KeyboardInterrupt:
+            sys.exit("stopped; what was evaluated is kept")
+        finally:
+            write_runs(runs, made_by)
 
 
 if __name__ == "__main__":
