@@ -97,7 +97,12 @@ def test_its_differences_are_the_reports():
     rows = {task: cell for task, cell, _ in rows_of(TABLES, "Differences")}
     pattern = r"(\S+) \[(\S+), (\S+)\], p = (\S+)"
     mean, low, high, p = re.match(pattern, rows["hopper-medium"]).groups()
-    assert f"is {mean} (95% interval {low} to {high}, p = {float(p):.1g}, W" in README
+    interval = f"95% interval {low} to {high}, p = {float(p):.1g}"
+    assert f"is {mean} on *hopper-medium* ({interval}, Welch's t test)" in README
+    mean, low, high, p = re.match(pattern, rows["halfcheetah-medium"]).groups()
+    interval = f"{low} to {high}, p = {float(p):.1g}"
+    assert f"two seeds, {mean} on *halfcheetah-medium* ({interval})" in README
+    assert "(2, 2;" in rows["halfcheetah-medium"]
     mean, low, high, p = re.match(pattern, rows["walker2d-medium"]).groups()
     assert f"it is {mean} ({low} to {high}, p = {p})" in README
     assert f"where the lead could be chance (p = {p})" in README
