@@ -418,6 +418,8 @@ def draw(path, panels):
                 axis.set_yscale("log")
         for level, color, line in levels:
             axis.axhline(level, color=color, linestyle=line, linewidth=1)
+            axis.update_datalim([(0, level)], updatex=False)  # with a margin
+        axis.autoscale_view()
         axis.set(title=title, xlabel="training steps (thousands)", ylabel=ylabel)
         axis.grid(alpha=0.3)
     for axis in axes.flat[len(panels) :]:
