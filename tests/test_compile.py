@@ -126,13 +126,16 @@ def test_a_continued_adam_has_the_same_powers_of_its_betas():
     assert continued.beta2_power.item() != 0.999**5000
 
 
-@pytest.mark.parametrize("kind", ["Adam", "AdamW"])
-@pytest.mark.parametrize("option", ["weight_decay", "amsgrad", "maximize", "groups"])
-def test_another_adam_is_refused(kind, option):
+OTHER_ADAMS = [("Adam", {x: True}) for x in ("weight_decay", "amsgrad", "maximize")]
+OTHER_ADAMS += [("Adam", {}), ("AdamW", {}), ("NAdam", {})]
+
+
+@pytest.mark.parametrize("kind, options", OTHER_ADAMS)
+def test_another_adam_is_refused(kind, options):
     parameters = torch.nn.Linear(2, 1).parameters()
-    if option == "groups":
-        parameters, option = [{"params": x} for x in parameters], "fused"
-    optimizer = getattr(torch.optim, kind)(parameters, **{option: True})
+    if (kind, options) == ("Adam", {}):
+        parameters = [{"params": x} for x in parameters]  # two groups
+    optimizer = getattr(torch.optim, kind)(parameters, **options)
     with pytest.raises(NotImplementedError):
         compiled.TraceableAdam(optimizer)
 

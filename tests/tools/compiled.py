@@ -29,8 +29,8 @@ class TraceableAdam:
 
     def __init__(self, optimizer, device="cpu"):
         group, *others = optimizer.param_groups
-        options = group["weight_decay"], group["amsgrad"], group["maximize"]
-        if type(optimizer) is not torch.optim.Adam or others or any(options):
+        known = type(optimizer) is torch.optim.Adam and not others
+        if not known or group["weight_decay"] or group["amsgrad"] or group["maximize"]:
             raise NotImplementedError("compiled.py knows Adam as the scripts have it")
         self.parameters = group["params"]
         self.lr, self.betas, self.eps = group["lr"], group["betas"], group["eps"]
