@@ -204,7 +204,7 @@ def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
         if cells["task"].endswith("-medium"):
             for system in ("wPC", "TD3+BC", "wBC"):
                 ours, paper = float(cells[system]), float(cells[f"{system}, paper"])
-                assert abs(ours - paper) <= 2.5
+                assert abs(ours - paper) <= 3
                 count += 1
         elif cells["task"].endswith("-medium-replay"):
             for system in ("wPC", "TD3+BC"):
@@ -212,7 +212,7 @@ def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
     assert count == 9 and len(below) == 6
     text = f"they are {min(below):.0f} to {max(below):.0f} below the paper's"
     assert f"on *medium-replay* data, which are not D4RL's, {text}" in README
-    assert "all three algorithms score within 2.5 points of the paper" in README
+    assert "all three algorithms score within 3 points of the paper" in README
 
 
 def test_td3_bc_is_as_near_to_its_curves_on_d4rls_files_as_it_says():
