@@ -305,6 +305,7 @@ import os, signal, sys
 sys.path.insert(0, "tests/tools")
 import make_dataset
 collect = make_dataset.collect
+signal.signal(signal.SIGINT, signal.default_int_handler)  # also where it is ignored
 def stopped(*arguments):
     for i, progress in enumerate(collect(*arguments)):
         yield progress
