@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""TD3+BC (Fujimoto and Gu, NeurIPS 2021), in one file: Algorithm 1 without V and w.
+"""TD3+BC (Fujimoto and Gu, NeurIPS 2021), in one file: wPC without V and w.
 
 The policy maximises Q, and a constraint draws it to the dataset's actions:
 
@@ -53,7 +53,7 @@ class Args:
     max_timesteps: int = 1_000_000
     """number of training steps"""
     eval_freq: int = 5_000
-    """evaluate, log and save a checkpoint every this many steps"""
+    """number of steps between evaluations; each logs and saves a checkpoint"""
     eval_episodes: int = 10
     """number of episodes in an evaluation"""
     device: Literal["cpu", "cuda"] = "cuda" if torch.cuda.is_available() else "cpu"
@@ -73,7 +73,7 @@ class Args:
     noise_clip: float = 0.5
     """largest noise on the target action, relative to max_action"""
     policy_freq: int = 2
-    """update the policy and the target networks every this many steps"""
+    """number of steps between updates of the policy and the target networks"""
     actor_lr: float = 3e-4
     """learning rate of the actor"""
     critic_lr: float = 3e-4
@@ -81,7 +81,7 @@ class Args:
 
     # Policy constraint
     alpha: float = 2.5
-    """sets lambda: how much Q counts beside the constraint; by default the paper's"""
+    """sets lambda: how much Q counts; by default what the paper has for --env"""
 
     def __post_init__(self):
         if self.run_dir is None:
@@ -131,11 +131,11 @@ class Critic(nn.Module):
         self.q2_net = mlp(state_dim + action_dim, 1)
 
     def forward(self, s, a):
-        sa = torch.cat([s, a], dim=-1)
+        sa = torch.cat([s, a], dim=1)
         return self.q1_net(sa), self.q2_net(sa)
 
     def q1(self, s, a):
-        return self.q1_net(torch.cat([s, a], dim=-1))
+        return self.q1_net(torch.cat([s, a], dim=1))
 
 
 # --- Algorithm 1 ----------------------------------------------------------------------
@@ -228,8 +228,7 @@ def d4rl_robot(env):
 def use_d4rl_physics(env):
     """Makes a -v4 robot move as in MuJoCo 2.0, with which D4RL was recorded.
 
-    A capsule then had the mass and inertia of its cylindrical part, lengthened by half
-    a radius at each end (exact since MuJoCo 2.1.2), and contact margins were not added.
+    Capsules had the mass and inertia of cylinders half a radius shorter at each end.
     """
     model = env.unwrapped.model
     spec = mujoco.MjSpec.from_file(env.unwrapped.fullpath)
@@ -245,7 +244,8 @@ def use_d4rl_physics(env):
     old_model = spec.compile()
     for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
         getattr(model, name)[:] = getattr(old_model, name)
-    model.geom_margin /= 2
+    if mujoco.mj_version() >= 350:  # since 3.5, a contact's two margins are added
+        model.geom_margin /= 2  # before, the larger counted; Hopper's are all the same
     mujoco.mj_setConst(model, env.unwrapped.data)  # recompute what masses determine
     return env
 
@@ -257,7 +257,7 @@ def make_envs(env, num_envs):
     name, wrappers = (robot[0], [use_d4rl_physics]) if robot else (env, None)
     envs = gym.make_vec(name, num_envs, vectorization_mode="sync", wrappers=wrappers)
     states, actions = envs.single_observation_space, envs.single_action_space
-    time_limit = envs.envs[0].spec.max_episode_steps
+    time_limit = envs.spec.max_episode_steps
     if not (
         type(states) is type(actions) is gym.spaces.Box
         and len(states.shape) == len(actions.shape) == 1
@@ -278,7 +278,7 @@ def evaluate(envs, actor, mean, std, args):
 
     Returns the mean and deviation of the returns and, on D4RL's robots, the score.
     """
-    # The same starts at each evaluation, shared by no two seeds: environment i adds i.
+    # The same starts in every evaluation, others for every seed; environment i adds i.
     observations, _ = envs.reset(seed=1000 * (args.seed + 100))
     returns = np.zeros(envs.num_envs)
     running = np.full(envs.num_envs, True)
@@ -365,7 +365,7 @@ def load_dataset(path, state_dim, action_dim, max_action, args):
         f"--env {args.env} allows {max_action:g}"
     )
     if not keep.size or largest > 1.001 * max_action:
-        sys.exit(f"{facts}: it needs a transition, and no action above that")
+        sys.exit(f"{facts}: it needs transitions, and no larger actions")
     print(facts)
     arrays.setdefault("next_observations", np.roll(arrays["observations"], -1, axis=0))
 
@@ -406,7 +406,7 @@ def write_file(path, content):
 def save(run_dir, checkpoint):
     """Writes checkpoint.pt and, from the evaluations in it, evaluations.csv."""
     content, table = io.BytesIO(), io.StringIO()
-    torch.save(checkpoint, content)  # in memory: on a full disk it raises no OSError
+    torch.save(checkpoint, content)  # in memory: a full disk would be a RuntimeError
     write_file(run_dir / "checkpoint.pt", content.getvalue())
     rows = checkpoint["evaluations"]  # the first, at step 0, has no losses
     writer = csv.DictWriter(table, max(rows, key=len), lineterminator="\n")
@@ -439,7 +439,7 @@ def train(args):
         pairs = checkpoint["args"].items() ^ asdict(args).items()  # what differs
         changed = dict(pairs).keys() - {"max_timesteps", "device", "dataset", "run_dir"}
         if changed:
-            sys.exit(f"{run_dir} had another script or {' and '.join(changed)}")
+            sys.exit(f"{run_dir} began with another script or {' and '.join(changed)}")
         for name, state in checkpoint["agent"].items():
             getattr(agent, name).load_state_dict(state)
         torch.set_rng_state(checkpoint["rng_state"])
@@ -461,7 +461,7 @@ def train(args):
         if step % args.eval_freq and step < args.max_timesteps:
             continue
 
-        scalars = {k: x.item() for k, x in metrics.items()}  # a GPU finishes its steps
+        scalars = {k: x.item() for k, x in metrics.items()}  # waits for the GPU
         speed = (step - clock_step) / (time.perf_counter() - clock)
         row = {"step": step, **evaluate(envs, agent.actor, mean, std, args), **scalars}
         row |= {"steps_per_second": speed, "best_discounted_return": best_return}

@@ -119,6 +119,18 @@ def test_margins_are_halved_and_collisions_keep_the_capsules(robot):
         assert np.array_equal(getattr(model, name), getattr(stock, name))
 
 
+@pytest.mark.parametrize(("version", "divisor"), [(340, 1), (350, 2), (3015000, 2)])
+def test_margins_are_halved_where_mujoco_adds_them(
+    script, version, divisor, monkeypatch
+):
+    """`mj_version` of MuJoCo 3.4.0 is 340, that of 3.15.0 is 3015000."""
+    env = script.make_envs("Hopper-v4", 1).envs[0]
+    stock = env.unwrapped.model.geom_margin.copy()
+    monkeypatch.setattr(mujoco, "mj_version", lambda: version)
+    script.use_d4rl_physics(env)
+    assert np.array_equal(env.unwrapped.model.geom_margin, stock / divisor)
+
+
 # Against D4RL
 
 

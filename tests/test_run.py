@@ -216,7 +216,7 @@ def test_the_help_explains_every_argument(script, monkeypatch, capsys):
     words = " ".join(capsys.readouterr().out.replace("│", " ").split())
     for name in script.Args.__dataclass_fields__:
         assert f"--{name.replace('_', '-')}" in words
-    assert "evaluate, log and save a checkpoint every this many steps" in words
+    assert "number of steps between evaluations; each logs and saves" in words
 
 
 def test_in_a_notebook(monkeypatch, capsys, tmp_path):
@@ -357,11 +357,11 @@ def test_a_run_of_a_gpu_goes_on_without_one(run_dir):
 
 
 CONTRADICTIONS = [
-    ("wpc", ["--seed", 1], "had another script or seed"),
-    ("wpc", ["--alpha", 1.0], "had another script or alpha"),
-    ("wpc", ["--batch-size", 32], "had another script or batch_size"),
-    ("td3_bc", [], "had another script or "),
-    ("wbc", [], "had another script or "),
+    ("wpc", ["--seed", 1], "began with another script or seed"),
+    ("wpc", ["--alpha", 1.0], "began with another script or alpha"),
+    ("wpc", ["--batch-size", 32], "began with another script or batch_size"),
+    ("td3_bc", [], "began with another script or "),
+    ("wbc", [], "began with another script or "),
 ]
 
 
