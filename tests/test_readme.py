@@ -98,7 +98,10 @@ def test_its_differences_are_the_reports():
     pattern = r"(\S+) \[(\S+), (\S+)\], p = (\S+)"
     mean, low, high, p = re.match(pattern, rows["hopper-medium"]).groups()
     interval = f"95% interval {low} to {high}, p = {float(p):.1g}"
-    assert f"is {mean} on *hopper-medium* ({interval}, Welch's t test)" in README
+    assert (
+        f"is {mean} on *hopper-medium* ({interval}, Welch's t test, uncorrected)"
+        in README
+    )
     mean, low, high, p = re.match(pattern, rows["halfcheetah-medium"]).groups()
     interval = f"{low} to {high}, p = {float(p):.1g}"
     assert f"two seeds, {mean} on *halfcheetah-medium* ({interval})" in README
@@ -175,6 +178,17 @@ def test_what_it_says_of_curves_is_in_the_runs():
     ours, td3_bc = (f"{np.median(x):.0f}" for x in jumps)
     most = f"by {max(x.max() for x in jumps):.0f} at most"
     assert f"by {td3_bc} (TD3+BC) and {ours} points (wPC)" in README and most in README
+
+
+def test_its_last_evaluations_are_in_the_runs():
+    last = (
+        f"{scores(script, 'hopper-medium')[1][:, -1].mean():.1f}"
+        for script in ("wpc", "td3_bc")
+    )
+    sentence = (
+        "By last evaluations, as the paper has them, *hopper-medium* has {} (wPC)"
+    )
+    assert (sentence + " and {} (TD3+BC).").format(*last) in README
 
 
 def test_what_it_says_of_q_running_away_is_in_the_runs():
