@@ -403,7 +403,7 @@ def load_dataset(path, state_dim, action_dim, max_action, args):
                         f"has shape {array.shape}"
                     )
                 arrays[key] = array.reshape(rows, width)
-    except OSError as error:
+    except Exception as error:  # of several types where a file is damaged
         sys.exit(f"{path} can't be read: {error}")
     timeouts = arrays.pop("timeouts")
     keep = np.flatnonzero(timeouts[:-1] == 0)

@@ -16,6 +16,7 @@ import torch
 from conftest import (
     DATASET,
     ROOT,
+    SCRIPTS,
     as_bits,
     assert_one_sentence,
     command,
@@ -338,6 +339,23 @@ def test_the_benchmark_runs_the_scripts(script):
     assert benchmark.Steps(benchmark.script_steps(script, compiled=False)).run(2) > 0
 
 
+def test_the_benchmark_compiles_what_it_calls_compiled(monkeypatch):
+    updates = []
+    for name in ("textbook_steps", "product_steps"):
+        monkeypatch.setattr(benchmark, name, lambda: None)
+    monkeypatch.setattr(
+        benchmark,
+        "compile_update",
+        lambda agent, update: lambda batch, step: updates.append(update),
+    )
+    made = benchmark.variants(benchmark.Args(), threads=1)
+    for script in SCRIPTS.values():
+        made[f"compiled {script.__name__}.py"].step(1)
+        assert updates == [script.Agent.update]
+        made[f"{script.__name__}.py"].step(1)
+        assert updates.pop() and not updates
+
+
 def test_the_textbook_loop_is_wpc(monkeypatch):
     """With the same networks and batch, four steps lead to the same parameters."""
     batch, made = random_batch(), []
@@ -396,12 +414,15 @@ def test_a_peer_is_measured_on_the_cpu(tmp_path):
 
 def test_the_benchmarks_table(monkeypatch, capsys):
     speeds = {"textbook": 100.0, "products": 250.0}
-    made = {k: types.SimpleNamespace(run=lambda _, x=x: x) for k, x in speeds.items()}
+    made = {}
+    for name, x in speeds.items():  # the first turn compiles; then three count
+        turns = iter([1.0, x, 9 * x, x])
+        made[name] = types.SimpleNamespace(run=lambda _, turns=turns: next(turns))
     monkeypatch.setattr(benchmark, "variants", lambda *_: made)
     monkeypatch.setattr(benchmark.os, "sched_setaffinity", lambda *_: None)
     monkeypatch.setattr(benchmark.os, "sched_getaffinity", lambda _: {0})
     monkeypatch.setattr(torch, "set_num_threads", lambda _: None)
-    benchmark.main(benchmark.Args(rounds=1))
+    benchmark.main(benchmark.Args(rounds=3))
     lines = capsys.readouterr().out.splitlines()
     assert lines[2:] == ["| textbook | 1.00 | 100 |", "| products | 2.50 | 250 |"]
 

@@ -395,7 +395,7 @@ def damage(content, rng):
 
 
 def test_damaged_files(tmp_path):
-    """They are told, by the script or the library, or load as something that fits."""
+    """They are told in a sentence, or load as something that fits."""
     rng, told = np.random.default_rng(0), 0
     arrays = d4rl_arrays(40)
     plain, packed = write_hdf5(tmp_path / "plain.hdf5", arrays), tmp_path / "packed"
@@ -410,8 +410,6 @@ def test_damaged_files(tmp_path):
         except SystemExit as stop:
             told += 1
             assert str(path) in stop.code and "\n" not in stop.code
-        except (KeyError, RuntimeError) as error:  # by these names h5py tells some
-            assert "synchronously" in str(error)
         else:
             assert dataset["observations"].shape[1] == 17
             assert all(torch.isfinite(column).all() for column in dataset.values())

@@ -110,6 +110,10 @@ def test_the_scripts_take_the_commands(tool, experiment, runs):
 
 
 def test_the_list_says_what_the_paper_compared(tool):
+    lines = listed(tool, "table1", "--seeds", 1)
+    assert sorted(line[1] for line in lines) == sorted(
+        ["wpc.py", "td3_bc.py", "wbc.py"] * 12
+    )
     lines = [" ".join(line) for line in listed(tool, "table2")]
     assert sum("--weight=exponential" in line for line in lines) == 12 * 5
     assert sum("--weight=random" in line for line in lines) == 12 * 5
@@ -274,6 +278,22 @@ def test_runs_on_different_data_are_no_seeds_of_one_system(tool, tmp_path):
     assert "'wBC', '') (different data, with best returns 10.0 and 11.0)" in printed
 
 
+def test_systems_on_different_data_are_not_compared(tmp_path):
+    for seed, task in itertools.product((0, 1), ("hopper_medium", "walker2d_medium")):
+        for script in ("wpc", "td3_bc", "wbc"):
+            folder = tmp_path / f"{script}{task}{seed}"
+            make_run(folder, script, task, seed, 10 + seed)
+            if script == "wbc":
+                path = folder / "evaluations.csv"
+                path.write_text(path.read_text().replace("10.0,5.0\n", "11.0,5.0\n"))
+    groups = experiments.read_groups(tmp_path)
+    systems = {system: groups["hopper-medium", system, ""] for _, system, _ in groups}
+    assert experiments.difference(systems["wPC"], systems["TD3+BC"]).startswith("0.0 [")
+    assert experiments.difference(systems["wPC"], systems["wBC"]) == "-"
+    assert experiments.interquartile_table(groups, ["wPC", "TD3+BC"])
+    assert not experiments.interquartile_table(groups, ["wPC", "wBC"])
+
+
 def test_q_is_drawn_where_returns_are_negative(tmp_path, monkeypatch):
     scales, plain = [], experiments.plt.close
     monkeypatch.setattr(
@@ -369,7 +389,11 @@ def test_the_data_have_a_score_of_their_own(tmp_path, monkeypatch):
     """Where the runs' best return is that of the data whose score is known."""
     for task in ("hopper_medium", "walker2d_medium"):
         make_run(tmp_path / task, "wpc", task, 0, 3)
+    path = make_run(tmp_path / "x", "wpc", "hopper_medium", 0, 3, discount=0.9)
+    path /= "evaluations.csv"  # of other arguments, with which returns differ
+    path.write_text(path.read_text().replace("10.0,5.0\n", "11.0,5.0\n"))
     groups = experiments.read_groups(tmp_path)
+    assert len(groups) == 3
     monkeypatch.setattr(experiments, "ROOT", tmp_path)
     path = tmp_path / "tests/results/datasets.csv"
     path.parent.mkdir(parents=True)

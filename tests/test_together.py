@@ -207,6 +207,11 @@ def test_runs_that_can_not_be_one_are_refused(tmp_path, lines, sentence):
         together.read_commands(path)
 
 
+def test_a_file_of_commands_that_is_not_there(tmp_path):
+    with pytest.raises(SystemExit, match=r"\[Errno 2\].*none.txt"):
+        together.read_commands(tmp_path / "none.txt")
+
+
 def test_comments_and_the_compiled_tool_are_passed_over(tmp_path):
     tool = "python tests/tools/compiled.py td3_bc.py --run-dir b"
     text = f"# two runs\n\npython wpc.py --run-dir a\n{tool}\n"
@@ -217,18 +222,24 @@ def test_comments_and_the_compiled_tool_are_passed_over(tmp_path):
 
 
 def test_what_was_evaluated_is_kept(monkeypatch, tmp_path):
-    """Where training is stopped, here in the evaluation at step 20."""
+    """Where training is stopped before the evaluation at step 20 has ended."""
     flags = f"--env halfcheetah --dataset {DATASET} --device cpu --run-dir {tmp_path} "
     flags += "--max-timesteps 40 --eval-freq 10"
     (tmp_path / "commands.txt").write_text(f"python wpc.py {flags}")
-    returns = iter([1.0, 2.0])
+    actors = []
 
-    def evaluate_run(*_):
-        for value in returns:
-            return {"mean_return": value}
-        raise KeyboardInterrupt
+    class Stopped(Future):
+        def result(self):
+            raise KeyboardInterrupt
 
-    monkeypatch.setattr(together, "evaluate_run", evaluate_run)
+    class Pool:
+        def submit(self, _, args, dims, actor, *__):
+            actors.append(actor)
+            future = Stopped() if len(actors) > 2 else Future()
+            if len(actors) <= 2:
+                future.set_result({"mean_return": float(len(actors))})
+            return future
+
     context = contextlib.nullcontext(Pool())
     monkeypatch.setattr(together, "ProcessPoolExecutor", lambda *_: context)
     line = ["together.py", str(tmp_path / "commands.txt"), "--no-compile"]
@@ -238,6 +249,11 @@ def test_what_was_evaluated_is_kept(monkeypatch, tmp_path):
     rows = csv.DictReader((tmp_path / "evaluations.csv").open())
     kept = [(row["step"], row["mean_return"]) for row in rows]
     assert kept == [("0", "1.0"), ("10", "2.0")]
+    policy = load(tmp_path)["agent"]["actor"]
+    assert all(np.array_equal(x, actors[1][name]) for name, x in policy.items())
+    assert len(actors) > 2 and not np.array_equal(
+        policy["net.4.bias"], actors[2]["net.4.bias"]
+    )
 
 
 def test_a_run_that_is_there_is_not_written_over(tmp_path):
@@ -306,6 +322,12 @@ def test_each_run_leaves_what_its_script_leaves(tmp_path):
     assert {"q", "v", "weight", "lmbda"} <= columns["wpc0"]
     assert "lmbda" in columns["td3_bc0"] and "v" not in columns["td3_bc0"]
     assert "weight" in columns["wbc1"] and "lmbda" not in columns["wbc1"]
+
+    # Before the first step, the script's own evaluation finds the same.
+    line = [*shlex.split(lines[-1])[1:-1], tmp_path / "own"]
+    assert run(sys.executable, *line, cwd=ROOT).returncode == 0
+    own = next(csv.DictReader((tmp_path / "own/evaluations.csv").open()))
+    assert rows[0]["mean_return"] == own["mean_return"]
 
     # The policy is the one that was evaluated last, and no script starts anew there.
     checkpoint = load(folder)

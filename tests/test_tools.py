@@ -7,6 +7,7 @@ tests/tools/make_minari_data.py): some episodes of Hopper-v5 end and some are cu
 all of Pendulum-v1's are cut off.
 """
 
+import hashlib
 import re
 import shlex
 import sys
@@ -139,6 +140,9 @@ def test_rows_follow_from_each_other_in_d4rls_physics(tmp_path, policy):
     state, _ = env.reset(seed=int(rng.integers(2**31)))
     assert np.array_equal(columns[0][0], np.float32(state))
     for i, action in enumerate(actions):
+        mean, std = make_dataset.distribution(policy, columns[0][i])
+        drawn = np.tanh(mean + std * rng.standard_normal(3))
+        assert action == pytest.approx(drawn, abs=1e-6)
         state, reward, *_ = env.step(action)
         assert np.array_equal(next_states[i], np.float32(state))
         assert rewards[i] == np.float32(reward)
@@ -177,6 +181,9 @@ def test_the_file_is_cut_off_at_its_last_step(tmp_path, capsys):
     expected += f"{np.mean(returns):.1f} +- {np.std(returns):.1f}, largest "
     expected += f"{np.max(returns):.1f}; D4RL's score {score:.1f}"
     assert expected in output
+    names = "observations actions rewards next_observations terminals timeouts"
+    content = b"".join(data[name].tobytes() for name in names.split())
+    assert f"arrays: {hashlib.sha256(content).hexdigest()}\n" in output
     run_printed_command(output, tmp_path / "run")
 
 
@@ -366,13 +373,18 @@ def full_disk(monkeypatch):
     monkeypatch.setattr(wpc, "write_file", fill)
 
 
-def test_a_full_disk_loses_nothing_that_was_collected(tmp_path, full_disk, capsys):
+def test_a_full_disk_loses_nothing_that_was_collected(
+    tmp_path, tmp_path_factory, full_disk, monkeypatch, capsys
+):
+    other = str(tmp_path_factory.mktemp("elsewhere"))
+    monkeypatch.setattr(make_dataset.tempfile, "mkdtemp", lambda: other)
     out = tmp_path / "data.hdf5"
     make_dataset.main(make_dataset.Args("hopper", 50, out, random=True))
     printed = capsys.readouterr().out
     assert f"{out} can't be written: [Errno 28] No space left on device" in printed
     assert not list(tmp_path.iterdir())
     (elsewhere,) = re.findall(r"--dataset (.*)", printed)
+    assert Path(elsewhere).parent == Path(other)
     assert len(read(Path(elsewhere))["rewards"]) == 50
 
 
@@ -703,8 +715,8 @@ def test_the_film_is_of_the_run(hopper_run, capsys):
     expected = f"{steps} steps, return {episode_return:.1f}, D4RL's score {score:.1f}"
     assert expected in capsys.readouterr().out
     with Image.open(folder / "policy.gif") as film:
-        assert film.size == (60, 60) and film.n_frames == -(-steps // 4)  # 125 fps
-        assert film.info["duration"] == 30 and "loop" in film.info
+        assert film.size == (60, 60) and film.n_frames == -(-steps // 5)  # 125 fps
+        assert film.info["duration"] == 40 and "loop" in film.info
 
 
 def test_frames_as_files(hopper_run):
@@ -717,6 +729,8 @@ def test_frames_as_files(hopper_run):
     assert not np.array_equal(pictures[0], pictures[2])
     play.main(play.Args(folder, folder / "frames/f%02d.png", frames=1, size=60))
     assert (folder / "frames/f00.png").exists()
+    play.main(play.Args(folder, folder / "50%/frames", frames=1, size=60))
+    assert (folder / "50%/frames/0000.png").exists()
 
 
 def test_the_camera_follows_the_robot(hopper_run):
@@ -741,7 +755,7 @@ def test_a_missing_graphics_library(tmp_path):
 
 
 def film(tmp_path, monkeypatch, name):
-    """play.py's main with an environment of three steps, whose pictures are grey."""
+    """play.py's main with an environment of two steps, whose pictures are grey."""
 
     class Grey(Delayed):
         spec = SimpleNamespace(max_episode_steps=3)
@@ -779,6 +793,7 @@ def test_a_full_disk_while_a_film_is_written(tmp_path, monkeypatch):
 NO_FILM = [
     ("policy.mov", "must end in .gif, .mp4 or %04d.png, or be a folder"),
     ("policy.png", "must end in .gif, .mp4 or %04d.png, or be a folder"),
+    ("100%.png", "must end in .gif, .mp4 or %04d.png, or be a folder"),
     ("policy%d.gif", "must end in .gif, .mp4 or %04d.png, or be a folder"),
     ("nofolder/policy.gif", "--out can't be written: [Errno 2]"),
     ("checkpoint.pt/x/%d.png", "--out can't be written: [Errno 20]"),

@@ -131,6 +131,11 @@ class Group:
         return self.scores[:, among][:, -10:].mean(axis=1)
 
     @property
+    def data(self):
+        """What tells one dataset of a task from another."""
+        return f"{self.best_return:.1f}"
+
+    @property
     def size(self):
         return f"{len(self.scores)}; {self.steps[-1] / 1000:,g}k"
 
@@ -244,9 +249,9 @@ def score_table(groups, tasks, systems):
     path = ROOT / "tests/results/datasets.csv"
     data = list(csv.DictReader(path.open())) if path.exists() else []
     data = {(row["task"], row["best_return"]): row["mean_score"] for row in data}
-    best = {x.task: f"{x.best_return:.1f}" for x in groups.values()}
+    best = {x.task: x.data for x in groups.values() if not x.others}
     header = ["task", "the data"]
-    rows = [[task, data.get((task, best[task]), "-")] for task in tasks]
+    rows = [[task, data.get((task, best.get(task)), "-")] for task in tasks]
     for system in systems:
         sources = [source for source in PUBLISHED if source.startswith(f"{system},")]
         header += [system, *sources]
@@ -262,7 +267,7 @@ def difference(group, other):
     if not group or not other or min(len(group.scores), len(other.scores)) < 2:
         return "-"
     steps = np.intersect1d(group.steps, other.steps)
-    if len(steps) < 10:
+    if len(steps) < 10 or group.data != other.data:
         return "-"
     ours, theirs = group.last_ten(steps), other.last_ten(steps)
     test = stats.ttest_ind(ours, theirs, equal_var=False)
@@ -292,9 +297,9 @@ def interquartile_table(groups, systems):
     alike, rows = {}, []
     for task in TASKS:
         of_task = [groups[task, s, ""] for s in systems if (task, s, "") in groups]
-        sizes = {group.size for group in of_task}
-        if len(of_task) == len(systems) and len(sizes) == 1 and len(of_task[0].q) > 1:
-            alike.setdefault(sizes.pop(), []).append(of_task)
+        kinds = {(group.size, group.data) for group in of_task}
+        if len(of_task) == len(systems) and len(kinds) == 1 and len(of_task[0].q) > 1:
+            alike.setdefault(of_task[0].size, []).append(of_task)
     for size, of_tasks in alike.items():
         row = [f"{', '.join(of_task[0].task for of_task in of_tasks)} ({size})"]
         for of_system in zip(*of_tasks, strict=True):

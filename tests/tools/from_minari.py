@@ -5,7 +5,9 @@
 
 The scripts make no transition of a row with a timeout, nor of the last row. So where an
 episode was cut off, its last observation gets a row of its own, without action and
-reward, and marked as a timeout; and no transition of the dataset is lost.
+reward, and marked as a timeout; and no transition of the dataset is lost. As such a row
+has a return of 0, best_discounted_return is at least 0; and where all episodes ended in
+a terminal state, the last row counts as an episode of return 0 for the static weight.
 
 A policy is evaluated on the environment that Minari records for that. Where it has
 arguments, a time limit or wrappers that its id alone does not give, --env must name one

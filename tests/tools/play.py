@@ -5,7 +5,9 @@ python tests/tools/play.py runs/RUN --out policy.gif
 """
 
 import importlib.util
+import math
 import os
+import re
 import sys
 import warnings
 from dataclasses import dataclass
@@ -54,9 +56,9 @@ def frame_path(out):
     """The path to write to, with %d for PNG frames; exits if that is not possible."""
     if out.suffix == "":
         out /= "%04d.png"
-    if out.suffix not in (".gif", ".mp4", ".png") or (out.suffix == ".png") != (
-        "%" in out.name
-    ):
+    film = out.suffix in (".gif", ".mp4") and "%" not in out.name
+    frames = re.fullmatch(r"[^%]*%\d*d[^%]*\.png", out.name)
+    if not (film or frames):
         sys.exit(f"--out {out} must end in .gif, .mp4 or %04d.png, or be a folder")
     if out.suffix == ".mp4" and not importlib.util.find_spec("imageio_ffmpeg"):
         sys.exit("an MP4 needs a further package: pip install imageio-ffmpeg")
@@ -134,7 +136,7 @@ def write(path, images, fps):
         imageio.mimsave(path, [np.asarray(image) for image in images], fps=fps)
     else:
         for i, image in enumerate(images):
-            image.save(str(path) % i)
+            image.save(path.with_name(path.name % i))
 
 
 def main(args):
@@ -143,7 +145,7 @@ def main(args):
     name = checkpoint["args"]["env"]
     env, observation = start(args, name)
     steps_per_second = env.metadata.get("render_fps", 30)
-    every = max(1, steps_per_second // args.fps)
+    every = math.ceil(steps_per_second / args.fps)
     images, episode_return, step, over = [], 0.0, 0, False
     progress = tqdm(total=env.spec.max_episode_steps, disable=None)
     while not over:

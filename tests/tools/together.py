@@ -220,7 +220,7 @@ class Runs:
         self.runs, self.dims, self.data, self.device = runs, dims, data, device
         self.metrics, self.graph = {}, None
         self.rows = [[] for _ in runs]  # of each run: (step, evaluation, other columns)
-        self.jobs = [None] * len(runs)  # of each run: what was evaluated last
+        self.jobs = [[] for _ in runs]  # of each run: (evaluation, what is evaluated)
         kinds, alphas = zip(*map(system, runs), strict=True)
         wpc.other_weight = weight_of_each_run(kinds, device)
 
@@ -399,7 +399,11 @@ def read_commands(path):
     """
     runs = []
     pattern = r"python (?:tests/tools/compiled\.py )?(wpc|td3_bc|wbc)\.py\b(.*)"
-    for line in path.read_text().splitlines():
+    try:
+        lines = path.read_text().splitlines()
+    except OSError as error:
+        sys.exit(str(error))
+    for line in lines:
         if not line.strip() or line.startswith("#"):
             continue
         command = re.fullmatch(pattern, line)
@@ -446,13 +450,17 @@ def load(runs, device):
     return Runs(runs, own_dims, own_data, device)
 
 
+def succeeded(future):
+    return future.done() and not future.exception()
+
+
 def write_runs(runs, made_by):
     """Writes what each run leaves, as far as it is evaluated."""
-    for args, rows, job in zip(runs.runs, runs.rows, runs.jobs, strict=True):
+    for args, rows, jobs in zip(runs.runs, runs.rows, runs.jobs, strict=True):
         done = [
             {"step": step} | future.result() | row
             for step, future, row in rows
-            if future.done() and not future.exception()
+            if succeeded(future)
         ]
         if not done:
             continue
@@ -467,7 +475,9 @@ def write_runs(runs, made_by):
         writer.writerows(done)
         wpc.write_file(folder / "evaluations.csv", table.getvalue().encode())
 
-        _, (*_, max_action), actor, mean, std = job
+        evaluated = [i for i, (future, _) in enumerate(jobs) if succeeded(future)]
+        del jobs[: evaluated[-1]]  # so that the first is the last that was evaluated
+        _, (*_, max_action), actor, mean, std = jobs[0][1]
         checkpoint = {
             "args": asdict(args) | {"made_by": "together.py"},  # so no script goes on
             "agent": {"actor": {k: torch.from_numpy(x) for k, x in actor.items()}},
@@ -490,7 +500,7 @@ def train(runs, options, pool, made_by):
                 waiting.append(pool.submit(evaluate_run, *job))
                 row["steps_per_second"] = speed
                 runs.rows[i].append((step, waiting[-1], row))
-                runs.jobs[i] = job
+                runs.jobs[i].append((waiting[-1], job))
 
     def wait(most):
         """Until at most so many evaluations are to come."""
@@ -548,13 +558,13 @@ def main():
     }
     print(f"{len(runs.runs)} runs on {made_by['trained_on']}", flush=True)
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(options.workers, context) as pool:
-        try:
+    try:
+        with ProcessPoolExecutor(options.workers, context) as pool:
             train(runs, options, pool, made_by)
-        except KeyboardInterrupt:
-            sys.exit("stopped; what was evaluated is kept")
-        finally:
-            write_runs(runs, made_by)
+    except KeyboardInterrupt:
+        sys.exit("stopped; what was evaluated is kept")
+    finally:  # when the pool has ended what it had begun
+        write_runs(runs, made_by)
 
 
 if __name__ == "__main__":
