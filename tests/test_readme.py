@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tyro
+from scipy import stats
 
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests/tools")]
@@ -245,6 +246,22 @@ def test_td3_bc_is_as_near_to_its_curves_on_d4rls_files_as_it_says():
         if task.endswith("-medium-replay")
     ]
     assert "it is {:.0f}, {:.0f} and {:.0f} points below".format(*below) in README
+
+
+def test_what_it_says_of_the_zoos_agents_is_in_its_table():
+    row = r"^\| (\w+ \w+) \| (\d+) ± (\d+) \| (\d+) ± (\d+) \| (\d+) ± (\d+) \|$"
+    d4rl, stock = {}, {}
+    for agent, *numbers in re.findall(row, README, re.M):
+        published, *ours = np.array(numbers, float).reshape(3, 2)
+        for (mean, std), values in zip(ours, (d4rl, stock), strict=True):
+            test = stats.ttest_ind_from_stats(
+                mean, std, 150, *published, 150, equal_var=False
+            )
+            values[agent] = test.pvalue
+            assert values is d4rl or mean < published[0]
+    assert len(d4rl) == 6 and f"(p ≥ {min(d4rl.values()):.2f}, Welch's t" in README
+    assert stock.pop("TQC HalfCheetah") > 0.05
+    assert f"fall short (p ≤ {max(stock.values()):.2f}):" in README
 
 
 def prose(text):
