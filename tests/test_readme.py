@@ -95,7 +95,8 @@ def test_its_results_are_the_reports():
 
 
 def test_its_differences_are_the_reports():
-    rows = {task: cell for task, cell, _ in rows_of(TABLES, "Differences")}
+    table = rows_of(TABLES, "Differences")
+    rows = {task: cell for task, cell, _ in table}
     pattern = r"(\S+) \[(\S+), (\S+)\], p = (\S+)"
     mean, low, high, p = re.match(pattern, rows["hopper-medium"]).groups()
     interval = f"95% interval {low} to {high}, p = {float(p):.1g}"
@@ -110,6 +111,11 @@ def test_its_differences_are_the_reports():
     mean, low, high, p = re.match(pattern, rows["walker2d-medium"]).groups()
     assert f"it is {mean} ({low} to {high}, p = {p})" in README
     assert f"where the lead could be chance (p = {p})" in README
+    over_wbc = {task: cell for task, _, cell in table}
+    mean, low, high, p = re.match(pattern, over_wbc["hopper-medium"]).groups()
+    assert f"it is {mean} on *hopper-medium* ({low} to {high}, p = {p})." in README
+    assert over_wbc["hopper-medium"].endswith("; 500k)")
+    assert "Over wBC, at step 500,000, it is" in README
 
 
 def arguments(script, words):
@@ -224,9 +230,11 @@ def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
         elif cells["task"].endswith("-medium-replay"):
             for system in ("wPC", "TD3+BC"):
                 below.append(float(cells[f"{system}, paper"]) - float(cells[system]))
+            assert float(cells["wPC"]) > float(cells["TD3+BC"])
+            assert float(cells["wPC, paper"]) > float(cells["TD3+BC, paper"])
     assert count == 9 and len(below) == 6
-    text = f"they are {min(below):.0f} to {max(below):.0f} below the paper's"
-    assert f"on *medium-replay* data, which are not D4RL's, {text}" in README
+    text = f"are {min(below):.0f} to {max(below):.0f} below its scores"
+    assert f"the single seeds agree with the paper's order and {text}" in README
     assert "all three algorithms score within 3 points of the paper" in README
 
 
