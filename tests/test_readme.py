@@ -112,10 +112,19 @@ def test_its_differences_are_the_reports():
     assert f"it is {mean} ({low} to {high}, p = {p})" in README
     assert f"where the lead could be chance (p = {p})" in README
     over_wbc = {task: cell for task, _, cell in table}
-    mean, low, high, p = re.match(pattern, over_wbc["hopper-medium"]).groups()
-    assert f"it is {mean} on *hopper-medium* ({low} to {high}, p = {p})." in README
-    assert over_wbc["hopper-medium"].endswith("; 500k)")
-    assert "Over wBC, at step 500,000, it is" in README
+    cells = [over_wbc[f"{robot}-medium"] for robot in ("hopper", "halfcheetah")]
+    cells.append(over_wbc["walker2d-medium"])
+    seeds = ["(3, 3; 500k)", "(2, 2; 500k)", "(3, 3; 500k)"]
+    assert [cell[-12:] for cell in cells] == seeds
+    numbers = []
+    for cell in cells:
+        mean, low, high, p = re.match(pattern, cell).groups()
+        numbers += [mean, f"({low} to {high}, p = {p})"]
+    assert (
+        "Its lead over wBC at step 500,000 is {} on *hopper-medium* {}, {} with two "
+        "seeds on *halfcheetah-medium* {} and, with one seed of wPC yet to recover, {} "
+        "on *walker2d-medium* {}."
+    ).format(*numbers) in README
 
 
 def arguments(script, words):
@@ -233,8 +242,8 @@ def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
             assert float(cells["wPC"]) > float(cells["TD3+BC"])
             assert float(cells["wPC, paper"]) > float(cells["TD3+BC, paper"])
     assert count == 9 and len(below) == 6
-    text = f"are {min(below):.0f} to {max(below):.0f} below its scores"
-    assert f"the single seeds agree with the paper's order and {text}" in README
+    text = f"{min(below):.0f} to {max(below):.0f} below its scores"
+    assert f"the single seeds agree with the paper's order, {text}" in README
     assert "all three algorithms score within 3 points of the paper" in README
 
 
