@@ -201,9 +201,7 @@ def test_its_last_evaluations_are_in_the_runs():
         f"{scores(script, 'hopper-medium')[1][:, -1].mean():.1f}"
         for script in ("wpc", "td3_bc")
     )
-    sentence = (
-        "By last evaluations, as the paper has them, *hopper-medium* has {} (wPC)"
-    )
+    sentence = "By last evaluations, the paper's measure, *hopper-medium* has {} (wPC)"
     assert (sentence + " and {} (TD3+BC).").format(*last) in README
 
 
