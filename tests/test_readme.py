@@ -223,6 +223,13 @@ def test_what_it_says_of_q_running_away_is_in_the_runs():
     assert f"all three seeds end between {lowest:.0f} and {highest:.0f}" in README
 
 
+def test_there_is_one_run_of_each_other_weight_or_alpha():
+    runs = sorted(path.name for path in (ROOT / "tests/results/runs").glob("wpc-*"))
+    one_each = ["wpc-alpha-1.0__walker2d-medium__1"]
+    assert runs == [*one_each, "wpc-exponential__walker2d-medium__0"]
+    assert "of other weights and alphas there is [one run each]" in README
+
+
 def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
     table = TABLES.split("## Table 1")[1].split("##")[0].splitlines()
     header, *rows = [line.split("|")[1:-1] for line in table if line.startswith("| ")]
