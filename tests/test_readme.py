@@ -227,7 +227,8 @@ def test_there_is_one_run_of_each_other_weight_or_alpha():
     runs = sorted(path.name for path in (ROOT / "tests/results/runs").glob("wpc-*"))
     one_each = ["wpc-alpha-1.0__walker2d-medium__1"]
     assert runs == [*one_each, "wpc-exponential__walker2d-medium__0"]
-    assert "of other weights and alphas there is [one run each]" in README
+    assert "other weights and alphas ([one run each]" in README
+    assert "of wPC-e and alpha 1.0)" in README
 
 
 def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
