@@ -430,7 +430,7 @@ def write_file(path, content):
 def save(run_dir, checkpoint):
     """Writes checkpoint.pt and, from the evaluations in it, evaluations.csv."""
     content, table = io.BytesIO(), io.StringIO()
-    torch.save(checkpoint, content)  # in memory: a full disk would be a RuntimeError
+    torch.save(checkpoint, content)  # in memory: its own full-disk error is no OSError
     write_file(run_dir / "checkpoint.pt", content.getvalue())
     rows = checkpoint["evaluations"]  # the first, at step 0, has no losses
     writer = csv.DictWriter(table, max(rows, key=len), lineterminator="\n")

@@ -432,8 +432,8 @@ def test_other_weights_and_what_is_drawn(tool, tmp_path, monkeypatch):
     names = list(systems)[:5]
     assert [float(row[name].split()[0]) for name in names] == [1, 11, 21, 31, 41]
     (row,) = tables["Differences to other weights"]
-    differences = [row[f"wPC - {name}"].split(" [")[0] for name in names[1:]]
-    assert differences == ["-10.0", "-20.0", "-30.0", "-40.0"]
+    differences = [row[f"wPC - {name}"].split(" [")[0] for name in names[2:]]
+    assert differences == ["-20.0", "-30.0", "-40.0"]
 
     def curves(panel):
         """Lowest, mean and highest of each curve, all of which are constant."""

@@ -225,8 +225,10 @@ def test_what_it_says_of_q_running_away_is_in_the_runs():
 
 def test_there_is_one_run_of_each_other_weight_or_alpha():
     runs = sorted(path.name for path in (ROOT / "tests/results/runs").glob("wpc-*"))
-    one_each = ["wpc-alpha-1.0__walker2d-medium__1"]
-    assert runs == [*one_each, "wpc-exponential__walker2d-medium__0"]
+    assert runs == [
+        "wpc-alpha-1.0__walker2d-medium__1",
+        "wpc-exponential__walker2d-medium__0",
+    ]
     assert "other weights and alphas ([one run each]" in README
     assert "of wPC-e and alpha 1.0)" in README
 

@@ -449,8 +449,8 @@ Scores are D4RL's normalized ones, or returns where a task is called "(mean retu
 score is the mean of a run's last ten evaluations; over seeds: mean ± sample standard
 deviation (seeds; training steps). What the paper and CORL have published is of D4RL's
 own files. "The data" is the mean score of the episodes trained on, where the report
-knows it (tests/results/datasets.csv). Runs whose arguments differ from the scripts'
-defaults are in the table on Q alone.
+knows it (tests/results/datasets.csv). Runs whose arguments, other than --weight, differ
+from the scripts' defaults are in the table on Q alone.
 """
 NOTES = {
     "Differences": "Mean, 95% interval and p of Welch's t test, not corrected for "
@@ -499,7 +499,9 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
         "Differences": difference_table(groups, tasks_of(*COMPARED), COMPARED),
         "Interquartile means": interquartile_table(groups, COMPARED),
         "Other weights (Table 2, Figure 4)": score_table(groups, others, weights),
-        "Differences to other weights": difference_table(groups, others, weights),
+        "Differences to other weights": difference_table(
+            groups, others, ["wPC", *OF_WEIGHTS.values()]
+        ),
         "When does Q run away?": q_table(groups),
         "TD3+BC here and on D4RL's files": reproduction_table(pairs),
     }
