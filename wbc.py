@@ -19,18 +19,20 @@ import hashlib
 import io
 import json
 import os
+import re
 import shlex
 import sys
 import time
 import warnings
 from dataclasses import asdict, dataclass
+from datetime import datetime
+from http.client import HTTPException
 from pathlib import Path
-from typing import Literal
-from urllib.request import urlretrieve
+from tempfile import TemporaryDirectory
+from urllib.request import urlopen
 
 import gymnasium as gym
 import h5py
-import mujoco
 import numpy as np
 import torch
 import torch.nn as nn
@@ -39,7 +41,14 @@ import tyro
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm, trange
 
-SCRIPT = Path(__file__)
+os.environ.pop("MUJOCO_GL", None)  # training draws nothing, and needs no such library
+import mujoco
+
+SCRIPT = Path(globals().get("__file__", "notebook"))  # a cell there has no file
+
+
+class UserError(Exception):
+    """What a user can mend, said in one sentence; main() prints it."""
 
 
 @dataclass
@@ -57,8 +66,8 @@ class Args:
     """number of steps between evaluations; each logs and saves a checkpoint"""
     eval_episodes: int = 10
     """number of episodes in an evaluation"""
-    device: Literal["cpu", "cuda"] = "cuda" if torch.cuda.is_available() else "cpu"
-    """where to train; by default on a GPU if there is one"""
+    device: str = "cuda" if torch.cuda.is_available() else "cpu"
+    """where to train: cpu, cuda, cuda:1, ...; by default on a GPU if there is one"""
     run_dir: str | None = None
     """folder to start the run in, or to continue it; by default a new one in runs/"""
 
@@ -85,14 +94,19 @@ class Args:
     def __post_init__(self):
         if self.run_dir is None:
             name = f"{Path(self.dataset or self.env).stem}__{SCRIPT.stem}__{self.seed}"
-            self.run_dir = f"runs/{name}__{time.strftime('%F_%H-%M-%S')}_{os.getpid()}"
-        counts = self.max_timesteps, self.eval_freq, self.eval_episodes
-        if min(*counts, self.batch_size, self.policy_freq) < 1:
+            self.run_dir = f"runs/{name}__{datetime.now():%Y-%m-%d_%H-%M-%S.%f}"
+        counts = [self.max_timesteps, self.eval_freq, self.eval_episodes]
+        counts += [self.batch_size, self.policy_freq]
+        if min(counts) < 1:
             raise ValueError("steps, frequencies, episodes and batch_size must be >= 1")
         if not (0 <= self.discount <= 1 and 0 <= self.tau <= 1):
             raise ValueError("discount and tau must be between 0 and 1")
-        if not (self.dataset or d4rl_robot(self.env)):
-            raise ValueError(f"{self.env} can't be downloaded: it needs --dataset")
+        known = self.env in D4RL_ROBOTS or not d4rl_robot(self.env)
+        if not (D4RL_TASK.fullmatch(self.env) or (self.dataset and known)):
+            raise ValueError(
+                f"--env {self.env} must be a task of D4RL's, {D4RL_TASK.pattern}, or "
+                "with --dataset one of these robots or a Gymnasium id"
+            )
 
 
 # --- Networks -------------------------------------------------------------------------
@@ -152,7 +166,10 @@ class Value(nn.Module):
 
 
 class Agent:
-    """The networks with their optimizers, and the update of Algorithm 1."""
+    """The networks with their optimizers, and the update of Algorithm 1.
+
+    A checkpoint holds the state_dict() of every attribute but `args`.
+    """
 
     def __init__(self, state_dim, action_dim, max_action, args):
         self.args = args
@@ -168,9 +185,10 @@ class Agent:
         self.value_optimizer = adam(self.value, args.value_lr)
 
     def update(self, batch, step):
-        """Takes step `step` (from 1) of Algorithm 1 and returns its metrics by name.
+        """Does one step of Algorithm 1, the first being step 1; returns its metrics.
 
-        `batch` holds tensors (B, width) under the names that `load_dataset` gives them.
+        `batch` holds observations and next_observations (B, state_dim), actions (B,
+        action_dim), rewards and terminals (B, 1).
         """
         args, max_action = self.args, self.actor.max_action
         s, a, r = batch["observations"], batch["actions"], batch["rewards"]
@@ -184,6 +202,7 @@ class Agent:
             a_next = a_next.clamp(-max_action, max_action)
             q1_next, q2_next = self.critic_target(s_next, a_next)
             y = r + args.discount * (1 - done) * torch.min(q1_next, q2_next)
+            assert y.shape == q1_next.shape, "rewards and terminals must be (B, 1)"
 
         # Critics: Q1 and Q2 fit the target
         q1, q2 = self.critic(s, a)
@@ -242,6 +261,10 @@ D4RL_ROBOTS = {  # Gymnasium's name, and the returns that D4RL scores 0 and 100
     "hopper": ("Hopper-v4", -20.272305, 3234.3),
     "walker2d": ("Walker2d-v4", 1.629008, 4592.3),
 }
+D4RL_TASK = re.compile(
+    "(halfcheetah|hopper|walker2d)-"
+    "(random|medium|medium-replay|full-replay|medium-expert|expert)(-v2)?"
+)
 
 
 def d4rl_robot(env):
@@ -252,7 +275,8 @@ def d4rl_robot(env):
 def use_d4rl_physics(env):
     """Makes a -v4 robot move as in MuJoCo 2.0, with which D4RL was recorded.
 
-    Capsules had the mass and inertia of cylinders half a radius shorter at each end.
+    A capsule then had the mass and inertia of a cylinder: that between its two caps,
+    lengthened by half the radius at each end.
     """
     model = env.unwrapped.model
     spec = mujoco.MjSpec.from_file(env.unwrapped.fullpath)
@@ -268,15 +292,17 @@ def use_d4rl_physics(env):
     old_model = spec.compile()
     for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
         getattr(model, name)[:] = getattr(old_model, name)
-    if mujoco.mj_version() >= 350:  # since 3.5, a contact's two margins are added
-        model.geom_margin /= 2  # before, the larger counted; Hopper's are all the same
+    # Since 3.5.0 (which is 3005000) a contact's two margins are added; before, the
+    # larger counted. Hopper's are all equal, so halving them is exact.
+    if mujoco.mj_version() >= 3005000:
+        model.geom_margin /= 2
     mujoco.mj_setConst(model, env.unwrapped.data)  # recompute what masses determine
     return env
 
 
 def make_envs(env, num_envs):
     """`num_envs` environments for a task, robot or Gymnasium id, stepped together."""
-    warnings.filterwarnings("ignore", ".*out of date")  # -v4 is what we want
+    warnings.filterwarnings("ignore", ".*(out of date|settotalmass)")  # of -v4
     robot = d4rl_robot(env)
     name, wrappers = (robot[0], [use_d4rl_physics]) if robot else (env, None)
     envs = gym.make_vec(name, num_envs, vectorization_mode="sync", wrappers=wrappers)
@@ -286,10 +312,10 @@ def make_envs(env, num_envs):
         type(states) is type(actions) is gym.spaces.Box
         and len(states.shape) == len(actions.shape) == 1
         and actions.is_bounded()
-        and np.ptp([-actions.low, actions.high]) == 0
+        and np.ptp([-actions.low, actions.high]) == 0  # all bounds are -x or x
         and time_limit
     ):
-        sys.exit(
+        raise UserError(
             f"--env {env} needs one-dimensional Boxes of states (has {states}) and of "
             f"actions from -x to x (has {actions}), and a time limit (has {time_limit})"
         )
@@ -302,7 +328,8 @@ def evaluate(envs, actor, mean, std, args):
 
     Returns the mean and deviation of the returns and, on D4RL's robots, the score.
     """
-    # The same starts in every evaluation, others for every seed; environment i adds i.
+    # Every evaluation starts from the same states, but each seed has its own, as
+    # Gymnasium seeds environment i with seed + i.
     observations, _ = envs.reset(seed=1000 * (args.seed + 100))
     returns = np.zeros(envs.num_envs)
     running = np.full(envs.num_envs, True)
@@ -332,75 +359,97 @@ def download_dataset(task):
     name = task.removesuffix("-v2").replace("-", "_") + "-v2.hdf5"
     folder = os.environ.get("D4RL_DATASET_DIR", "~/.d4rl/datasets")
     path = Path(os.path.expanduser(folder), name)
-    if path.exists():
-        return path
     for server in D4RL_SERVERS:
+        if path.exists():  # perhaps by now, as another process downloads it too
+            break
         try:
-            os.makedirs(path.parent, exist_ok=True)
             print("downloading from", server)
-            os.replace(urlretrieve(server + name, f"{path}.tmp")[0], path)
-            return path
-        except OSError as error:
+            os.makedirs(path.parent, exist_ok=True)
+            with TemporaryDirectory(dir=path.parent) as own:
+                part = Path(own, name)
+                part.write_bytes(urlopen(server + name, timeout=60).read())
+                h5py.File(part).close()  # fails if it is a login page, say
+                os.replace(part, path)
+        except (OSError, HTTPException) as error:
             print(error)
-    sys.exit(
-        f"{path} could not be downloaded: set D4RL_DATASET_DIR to the folder that has "
-        "it, or name a file with --dataset"
-    )
+    if not path.exists():
+        raise UserError(
+            f"{path} could not be downloaded: set D4RL_DATASET_DIR to the folder that "
+            "has it, or name a file with --dataset"
+        )
+    return path
 
 
-def load_dataset(path, state_dim, action_dim, max_action, args):
-    """The transitions of an HDF5 file in D4RL's format, as in d4rl.qlearning_dataset.
+def read_dataset(path, state_dim, action_dim, max_action):
+    """The columns of an HDF5 file in D4RL's format, {name: float32 array (N, width)}.
 
-    Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]); where the file
-    has next_observations, which d4rl ignores, these replace o[i + 1]. As in d4rl, rows
-    with a timeout, whose o[i + 1] is in the next episode, and the last row give none.
-
-    Returns them by name, float32 tensors (N, width) with normalized states; the mean
-    and std, each (state_dim,), that normalize them; and the rows' best discounted
-    return-to-go, to compare Q with. Exits with a sentence if the file doesn't fit.
+    Raises UserError if the file can't be read or doesn't fit.
     """
+    widths = {"observations": state_dim, "next_observations": state_dim}
+    widths |= {"actions": action_dim, "rewards": 1, "terminals": 1, "timeouts": 1}
     arrays = {}
-    widths = {"observations": state_dim, "actions": action_dim}
-    widths |= {"rewards": 1, "terminals": 1, "timeouts": 1}
     try:
         with h5py.File(path) as file:
-            if "next_observations" in file:
-                widths["next_observations"] = state_dim
-            for key, width in widths.items():
-                if key not in file:
-                    sys.exit(
-                        f"{path} has no {key}, which D4RL's format needs (timeouts: 1 "
-                        "where an episode was cut off, else 0)"
-                    )
-                array, rows = np.float32(file[key][:]), len(file["observations"])
-                if array.size != rows * width or not np.isfinite(array).all():
-                    sys.exit(
-                        f"{path}: {key} must be finite, in shape {(rows, width)}; it "
-                        f"has shape {array.shape}"
-                    )
-                arrays[key] = array.reshape(rows, width)
-    except Exception as error:  # of several types where a file is damaged
-        sys.exit(f"{path} can't be read: {error}")
-    timeouts = arrays.pop("timeouts")
-    keep = np.flatnonzero(timeouts[:-1] == 0)
-    largest = np.abs(arrays["actions"]).max(initial=0)
-    facts = (
-        f"{path} has {len(keep):,} transitions, with actions up to {largest:.4g} where "
-        f"--env {args.env} allows {max_action:g}"
-    )
-    if not keep.size or largest > 1.001 * max_action:
-        sys.exit(f"{facts}: it needs transitions, and no larger actions")
-    print(facts)
-    arrays.setdefault("next_observations", np.roll(arrays["observations"], -1, axis=0))
+            for key in widths:
+                if isinstance(file.get(key), h5py.Group):
+                    raise TypeError(f"{key} is a group of {', '.join(file[key])}")
+                if key in file:
+                    column = np.float32(file[key][:])
+                    arrays[key] = column[:, None] if column.ndim == 1 else column
+    except Exception as error:  # h5py raises nearly any type where a file is damaged
+        raise UserError(f"{path} can't be read: {error}") from error
+    missing = widths.keys() - arrays.keys() - {"next_observations"}
+    if missing:
+        raise UserError(
+            f"{path} has no {' and no '.join(sorted(missing))}, which D4RL's format "
+            "needs (timeouts: 1 where an episode was cut off, else 0)"
+        )
+    for key, column in arrays.items():
+        if column.shape != (len(arrays["rewards"]), widths[key]):
+            raise UserError(
+                f"{path}: {key} must have shape (N, {widths[key]}), with N the same "
+                f"for all, and has {column.shape} (MATLAB's have their axes reversed)"
+            )
+        good = np.isfinite(column)
+        if key in ("terminals", "timeouts"):
+            good = np.isin(column, (0, 1))
+        if key == "actions":
+            good = np.abs(column) <= 1.001 * max_action  # as a policy's tanh rounds
+        bad = np.flatnonzero(~good.all(axis=1))
+        if bad.size:
+            raise UserError(
+                f"{path}: {key} has {column[bad[0]]} in row {bad[0]}, and {bad.size:,} "
+                "such rows: numbers must be finite, terminals and timeouts 0 or 1, "
+                f"and actions from {-max_action:g} to {max_action:g}"
+            )
+    following = np.roll(arrays["observations"], -1, axis=0)
+    return {"next_observations": following} | arrays
 
-    rewards = arrays["rewards"].ravel().tolist()
-    ends = (arrays["terminals"] + timeouts).ravel() > 0
+
+def prepare_dataset(arrays, args):
+    """The transitions of the columns that `read_dataset` returns, ready for training.
+
+    Row i gives (o[i], a[i], r[i], next_observations[i], terminal[i]), where d4rl always
+    takes o[i + 1]. As in d4rl, rows with a timeout, whose o[i + 1] is in the next
+    episode, and the last row give none. A terminal row stays, whatever its timeout
+    says, as its next state doesn't count.
+
+    Returns them by name, float32 tensors (N, width) with normalized states; the mean
+    and std, each (state_dim,), that normalize them; and the best discounted return from
+    any row to its episode's end, to compare Q with.
+    """
+    terminals, timeouts = arrays["terminals"], arrays["timeouts"]
+    keep = np.flatnonzero((terminals >= timeouts)[:-1])
+    if not keep.size:
+        raise UserError("the dataset has 0 transitions: it needs rows without timeout")
+    rewards, ends = arrays["rewards"].ravel(), (terminals + timeouts).ravel() > 0
     best_return, return_to_go = -np.inf, 0.0
-    for i in reversed(range(len(rewards))):
-        return_to_go = rewards[i] + args.discount * return_to_go * (not ends[i])
+    for reward, end in zip(rewards[::-1].tolist(), ends[::-1], strict=True):
+        return_to_go = reward + args.discount * return_to_go * (not end)
         best_return = max(best_return, return_to_go)
     dataset = {k: torch.tensor(x[keep], device=args.device) for k, x in arrays.items()}
-    states = dataset["observations"].double()
+    del dataset["timeouts"]
+    states = dataset["observations"].double()  # a sum of float32 would lose digits
     mean = states.mean(dim=0).float()
     std = states.std(dim=0, correction=0).float() + 1e-3
     dataset["observations"].sub_(mean).div_(std)
@@ -427,54 +476,109 @@ def write_file(path, content):
     os.replace(file.name, path)
 
 
-def save(run_dir, checkpoint):
-    """Writes checkpoint.pt and, from the evaluations in it, evaluations.csv."""
+def save(run_dir, checkpoint, record):
+    """Writes checkpoint.pt, its evaluations as evaluations.csv, and args.json."""
     content, table = io.BytesIO(), io.StringIO()
-    torch.save(checkpoint, content)  # in memory: its own full-disk error is no OSError
+    # On a full disk torch.save raises RuntimeError, and writing bytes raises OSError,
+    # of which main() makes a sentence.
+    torch.save(checkpoint, content)
     write_file(run_dir / "checkpoint.pt", content.getvalue())
     rows = checkpoint["evaluations"]  # the first, at step 0, has no losses
     writer = csv.DictWriter(table, max(rows, key=len), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     write_file(run_dir / "evaluations.csv", table.getvalue().encode())
+    write_file(run_dir / "args.json", json.dumps(record, indent=2).encode())
+
+
+def last_change(path):
+    """When a file was last written, in nanoseconds; None if it is not there."""
+    return path.stat().st_mtime_ns if path.exists() else None
+
+
+def describe_run(args):
+    """What args.json holds: the arguments, the script's digest, and versions."""
+    script = SCRIPT.read_bytes() if SCRIPT.exists() else b""
+    record = asdict(args) | {"script_sha256": hashlib.sha256(script).hexdigest()}
+    return record | {x.__name__: x.__version__ for x in (torch, gym, mujoco, np)}
+
+
+def resume(path, agent, mean, args):
+    """Puts the agent and the random numbers where the checkpoint at `path` has them.
+
+    Returns the checkpoint; raises UserError if it is of another run.
+    """
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # of many types where a file is damaged
+        raise UserError(f"{path} is damaged: choose another --run-dir") from error
+    # A dataset may move, so its path is not compared, but the mean of its states.
+    began = checkpoint["args"] | {"dataset": checkpoint["mean"].tolist()}
+    now = asdict(args) | {"dataset": mean.tolist()}
+    may_change = {"max_timesteps", "device", "run_dir"}
+    for name in began | now:
+        if began.get(name) != now.get(name) and name not in may_change:
+            raise UserError(
+                f"{path.parent} was started with another {name}: choose another "
+                "--run-dir"
+            )
+    for name, state in checkpoint["agent"].items():
+        getattr(agent, name).load_state_dict(state)
+    torch.manual_seed(args.seed + checkpoint["step"])  # a GPU draws new numbers
+    torch.set_rng_state(checkpoint["rng_state"])  # a CPU goes on with the old ones
+    return checkpoint
+
+
+def check_device(device):
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise UserError(f"no --device {device} here; cpu works") from error
+
+
+def print_facts(path, dataset, max_action, args):
+    print(
+        f"{path} has {len(dataset['rewards']):,} transitions, "
+        f"{dataset['terminals'].sum():,.0f} of them terminal, with actions up to "
+        f"{dataset['actions'].abs().max():.4g} where --env {args.env} allows "
+        f"{max_action:g}"
+    )
 
 
 def train(args):
-    """Trains from the start, or continues the run that is in the run folder."""
+    """Trains from the start, or continues the run that is in the run folder.
+
+    Returns its evaluations, the rows of evaluations.csv as dictionaries.
+    """
     torch.set_flush_denormal(True)  # a CPU takes far longer for numbers below 1e-38
+    check_device(args.device)
     envs = make_envs(args.env, args.eval_episodes)
     state_dim = envs.single_observation_space.shape[0]
     action_dim = envs.single_action_space.shape[0]
     max_action = float(envs.single_action_space.high[0])
 
     dataset_path = args.dataset or download_dataset(args.env)
-    dataset, mean, std, best_return = load_dataset(
-        dataset_path, state_dim, action_dim, max_action, args
-    )
+    arrays = read_dataset(dataset_path, state_dim, action_dim, max_action)
+    dataset, mean, std, best_return = prepare_dataset(arrays, args)
+    print_facts(dataset_path, dataset, max_action, args)
 
     torch.manual_seed(args.seed)
     agent = Agent(state_dim, action_dim, max_action, args)
-    torch.manual_seed(args.seed)  # again, so that all scripts draw the same batches
+    # The other scripts build other networks: seeding again makes the batches equal.
+    torch.manual_seed(args.seed)
 
     run_dir, first_step, metrics, evaluations = Path(args.run_dir), 0, {}, []
     path = run_dir / "checkpoint.pt"
-    if path.exists():
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        pairs = checkpoint["args"].items() ^ asdict(args).items()  # what differs
-        changed = dict(pairs).keys() - {"max_timesteps", "device", "dataset", "run_dir"}
-        if changed:
-            sys.exit(f"{run_dir} began with another script or {' and '.join(changed)}")
-        for name, state in checkpoint["agent"].items():
-            getattr(agent, name).load_state_dict(state)
-        torch.set_rng_state(checkpoint["rng_state"])
+    saved = last_change(path)
+    if saved:
+        checkpoint = resume(path, agent, mean, args)
         evaluations = checkpoint["evaluations"]
         first_step = checkpoint["step"] + 1
+        if first_step > args.max_timesteps:
+            print(f"{run_dir} is finished; raise --max-timesteps to train longer")
 
     os.makedirs(run_dir, exist_ok=True)
-    script = hashlib.sha256(SCRIPT.read_bytes()).hexdigest()
-    versions = {x.__name__: x.__version__ for x in (torch, gym, mujoco, np)}
-    record = json.dumps(asdict(args) | versions | {"script_sha256": script}, indent=2)
-    write_file(run_dir / "args.json", record.encode())
+    record = describe_run(args)
     writer = SummaryWriter(run_dir, purge_step=first_step)
     clock = time.perf_counter()
     clock_step = first_step
@@ -482,49 +586,57 @@ def train(args):
         if step:  # at step 0 only evaluate, to find a broken environment early
             batch = sample_batch(dataset, args.batch_size)
             metrics |= agent.update(batch, step)
-        if step % args.eval_freq and step < args.max_timesteps:
-            continue
-
-        scalars = {k: x.item() for k, x in metrics.items()}  # waits for the GPU
-        speed = (step - clock_step) / (time.perf_counter() - clock)
-        row = {"step": step, **evaluate(envs, agent.actor, mean, std, args), **scalars}
-        row |= {"steps_per_second": speed, "best_discounted_return": best_return}
-        if not np.isfinite(list(row.values())).all():
-            sys.exit(f"diverged by step {step}: {row}; the last checkpoint is kept")
-        evaluations.append(row)
-        checkpoint = {
-            "args": asdict(args),
-            "step": step,
-            "agent": {k: x.state_dict() for k, x in vars(agent).items() if k != "args"},
-            "rng_state": torch.get_rng_state(),
-            "evaluations": evaluations,
-            "mean": mean,
-            "std": std,
-            "max_action": max_action,
-        }
-        for name, value in row.items():
-            writer.add_scalar(name, value, step)
-        writer.flush()
-        save(run_dir, checkpoint)
-        shown = {"mean_return", "normalized_score", "best_discounted_return", "q"}
-        line = ", ".join(f"{name} {x:.1f}" for name, x in row.items() if name in shown)
-        tqdm.write(f"step {step:,}: {line}")
-        sys.stdout.flush()  # so that a log file is up to date
-        clock = time.perf_counter()
-        clock_step = step
+        if step % args.eval_freq == 0 or step == args.max_timesteps:
+            scalars = {k: x.item() for k, x in metrics.items()}  # waits for the GPU
+            speed = (step - clock_step) / (time.perf_counter() - clock)
+            scores = evaluate(envs, agent.actor, mean, std, args)
+            row = {"step": step, **scores, **scalars}
+            row |= {"steps_per_second": speed, "best_discounted_return": best_return}
+            if not np.isfinite(list(row.values())).all():
+                raise UserError(
+                    f"diverged by step {step}: {row}; the last checkpoint is kept"
+                )
+            if last_change(path) != saved:
+                raise UserError(f"{run_dir} is used by another process, too")
+            evaluations.append(row)
+            checkpoint = {
+                "args": asdict(args),
+                "step": step,
+                "agent": {
+                    k: x.state_dict() for k, x in vars(agent).items() if k != "args"
+                },
+                "rng_state": torch.get_rng_state(),
+                "evaluations": evaluations,
+                "mean": mean,
+                "std": std,
+                "max_action": max_action,
+            }
+            for name, value in row.items():
+                writer.add_scalar(name, value, step)
+            writer.flush()
+            save(run_dir, checkpoint, record)
+            saved = last_change(path)
+            shown = {"mean_return", "normalized_score", "best_discounted_return", "q"}
+            line = ", ".join(f"{k} {x:.1f}" for k, x in row.items() if k in shown)
+            tqdm.write(f"step {step:,}: {line}")
+            sys.stdout.flush()  # so that a log file is up to date
+            clock = time.perf_counter()
+            clock_step = step
+    writer.close()
+    return evaluations
 
 
 def main():
     args = tyro.cli(Args, description=__doc__)
     command = shlex.join(sys.orig_argv)
-    if args.run_dir not in command:
+    if args.run_dir not in sys.orig_argv:
         command += " --run-dir " + shlex.quote(args.run_dir)
     print(f"to continue: {command}")
     try:
         train(args)
     except KeyboardInterrupt:
         sys.exit(f"stopped; to continue: {command}")
-    except (OSError, gym.error.Error) as error:
+    except (UserError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(error)
 
 

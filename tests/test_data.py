@@ -18,7 +18,8 @@ EPISODES = ROOT.parent / "shared/d4rl/episodes"
 
 def load_dataset(path, state_dim=17, action_dim=6, max_action=1.0, script=wpc, **kw):
     args = script.Args(env="Mine-v0", dataset=str(path), **kw)
-    return script.load_dataset(path, state_dim, action_dim, max_action, args)
+    arrays = script.read_dataset(path, state_dim, action_dim, max_action)
+    return script.prepare_dataset(arrays, args)
 
 
 def slow_load(arrays, discount):
@@ -31,7 +32,7 @@ def slow_load(arrays, discount):
     rows = len(rewards)
     for i in range(rows):
         episodes[-1].append(i)
-        if not timeouts[i] and i + 1 < rows:
+        if (terminals[i] or not timeouts[i]) and i + 1 < rows:
             transitions[i] = {key: arrays[key][i] for key in KEYS if key in arrays}
             if "next_observations" not in arrays:
                 transitions[i]["next_observations"] = arrays["observations"][i + 1]
@@ -86,7 +87,7 @@ def test_random_files_load_as_in_a_slow_loop(tmp_path, arrays):
     options = {"discount": 0.9, "weight": "static"}
     expected, episodes, best = slow_load(arrays, 0.9)
     if not expected:
-        with pytest.raises(SystemExit, match=r"\b0 transitions"):
+        with pytest.raises(wpc.UserError, match=r"\b0 transitions"):
             load_dataset(path, state_dim, action_dim, **options)
         return
     dataset, mean, std, best_return = load_dataset(
@@ -132,10 +133,22 @@ def test_which_rows_are_dropped_by_hand(tmp_path):
     arrays["timeouts"] = np.array([0, 1, 0, 0, 1, 0], bool)
     path = write_hdf5(tmp_path / "data.hdf5", arrays)
     *loaded, _ = load_dataset(path, 1, 1)
-    # 1 is a timeout, 4 a timeout and terminal, 5 the last row
-    assert raw(*loaded) == [0, 2, 3]
-    assert raw(*loaded, "next_observations") == [1, 3, 4]
-    assert loaded[0]["terminals"][:, 0].tolist() == [0, 1, 0]
+    # 1 is a timeout, 5 the last row; 4 is a timeout, too, but terminal
+    assert raw(*loaded) == [0, 2, 3, 4]
+    assert raw(*loaded, "next_observations") == [1, 3, 4, 5]
+    assert loaded[0]["terminals"][:, 0].tolist() == [0, 1, 0, 1]
+
+
+def test_rows_that_are_terminal_and_timeouts_end_the_task(tmp_path):
+    """As where Gymnasium's terminated and truncated are both true, or where timeouts
+    mark the end of every episode."""
+    arrays = d4rl_arrays(30, 1, 1)
+    ends = np.arange(30) % 10 == 9
+    for timeouts in (ends, np.zeros(30, bool)):
+        arrays |= {"terminals": ends, "timeouts": timeouts}
+        path = write_hdf5(tmp_path / "data.hdf5", arrays)
+        dataset, *_ = load_dataset(path, 1, 1)
+        assert dataset["terminals"][:, 0].tolist() == ends[:-1].tolist()
 
 
 def test_the_best_return_by_hand(tmp_path):
@@ -236,6 +249,15 @@ def test_batches_are_uniform_with_replacement():
     assert (counts / 40_000).tolist() == pytest.approx([0.25] * 4, abs=0.01)
 
 
+def test_arrays_in_memory_stay_as_they_are():
+    arrays = wpc.read_dataset(DATASET, 17, 6, 1.0)
+    copies = {key: column.copy() for key, column in arrays.items()}
+    args = wpc.Args(env="halfcheetah", dataset="-", weight="static", device="cpu")
+    wpc.prepare_dataset(arrays, args)
+    assert arrays.keys() == copies.keys()
+    assert all(np.array_equal(arrays[key], copies[key]) for key in arrays)
+
+
 def test_the_scripts_load_alike():
     ours, *facts = load_dataset(DATASET)
     for script in SCRIPTS.values():
@@ -266,49 +288,63 @@ def every(change):
     return lambda arrays: arrays.update({k: change(v) for k, v in arrays.items()})
 
 
+NAN = "numbers must be finite"
+FLAGS = "terminals and timeouts 0 or 1"
+ROW_7 = r"in row 7, and 1 such rows"
 BAD = [
-    (without("observations"), "has no observations"),
-    (without("actions"), "has no actions"),
-    (without("rewards"), "has no rewards"),
-    (without("terminals"), "has no terminals"),
-    (
-        without("timeouts"),
-        r"has no timeouts.*\(timeouts: 1 where an episode was cut off",
-    ),
+    (without("observations"), "has no observations, which"),
+    (without("actions"), "has no actions, which"),
+    (without("rewards"), "has no rewards, which"),
+    (without("terminals"), "has no terminals, which"),
+    (without("timeouts"), r"has no timeouts.*\(timeouts: 1 where an episode was cut"),
+    (lambda a: [a.pop("rewards"), a.pop("actions")], "has no actions and no rewards"),
     (
         replaced("actions", lambda x: x[:-1]),
-        r"actions must be finite, in shape \(40, 6\).* \(39, 6\)",
+        r"actions must have shape \(N, 6\), with N the same .* has \(39, 6\)",
     ),
     (
         replaced("timeouts", lambda x: x[:-2]),
-        r"timeouts must be finite, in shape \(40, 1\).* \(38,\)",
+        r"timeouts must have shape \(N, 1\), .* has \(38, 1\)",
     ),
     (
         replaced("observations", lambda x: x[:, :11]),
-        r"observations must be finite, in shape \(40, 17\).* \(40, 11\)",
+        r"observations must have shape \(N, 17\), .* has \(40, 11\)",
     ),
-    (replaced("actions", lambda x: x[:, :3]), r"actions must be .* \(40, 3\)"),
+    (replaced("actions", lambda x: x[:, :3]), r"actions must have .* \(40, 3\)"),
+    (replaced("actions", lambda x: x.T), r"has \(6, 40\) \(MATLAB's have their axes r"),
+    (every(lambda x: np.atleast_2d(x.T)), r"has \(.*, 40\) \(MATLAB's have their axes"),
     (
         replaced("rewards", lambda x: np.stack([x, x], 1)),
-        r"rewards must be finite, in shape \(40, 1\).* \(40, 2\)",
+        r"rewards must have shape \(N, 1\), .* has \(40, 2\)",
     ),
     (
         lambda a: a.update(next_observations=a["observations"][:-1]),
-        r"next_observations must be finite, in shape \(40, 17\).* \(39, 17\)",
+        r"next_observations must have shape \(N, 17\), .* has \(39, 17\)",
     ),
-    (with_value("observations", np.nan), "observations must be finite"),
-    (with_value("actions", -np.inf), "actions must be finite"),
-    (with_value("rewards", np.inf), "rewards must be finite"),
-    (with_value("terminals", np.nan), "terminals must be finite"),
+    (with_value("observations", np.nan), f"observations has .* {ROW_7}: {NAN}"),
+    (with_value("actions", -np.inf), f"actions has .*-inf.* {ROW_7}: {NAN}"),
+    (with_value("rewards", np.inf), rf"rewards has \[inf\] {ROW_7}: {NAN}"),
+    (with_value("terminals", np.nan), rf"terminals has \[nan\] {ROW_7}: {NAN}"),
     (
         lambda a: a.update(next_observations=np.full((40, 17), np.nan)),
-        "next_observations must be finite",
+        f"next_observations has .* in row 0, and 40 such rows: {NAN}",
     ),
-    (with_value("actions", 1.1), r"(?=.*--env Mine-v0).*actions up to 1\.1\b.*\b1\b"),
-    (with_value("actions", -5), r"(?=.*--env Mine-v0).*actions up to 5\b.*\b1\b"),
+    (with_value("actions", 1.1), rf"actions has \[1\.1 .* {ROW_7}.* from -1 to 1$"),
+    (with_value("actions", -5), rf"actions has \[-5\. .* {ROW_7}.* from -1 to 1$"),
+    (with_value("terminals", 255), rf"terminals has \[255\.\] {ROW_7}: .*{FLAGS}"),
+    (with_value("terminals", -1), rf"terminals has \[-1\.\] {ROW_7}: .*{FLAGS}"),
+    (with_value("terminals", 0.5), rf"terminals has \[0\.5\] {ROW_7}: .*{FLAGS}"),
+    (with_value("timeouts", 2), rf"timeouts has \[2\.\] {ROW_7}: .*{FLAGS}"),
     (every(lambda x: x[:0]), r"\b0 transitions"),
     (every(lambda x: x[:1]), r"\b0 transitions"),
-    (lambda a: a.update(timeouts=np.ones(40, bool)), r"\b0 transitions"),
+    (
+        lambda a: a.update(timeouts=np.ones(40, bool), terminals=np.zeros(40, bool)),
+        r"\b0 transitions",
+    ),
+    (
+        lambda a: a.update({"actions/arm": a.pop("actions"), "actions/leg": 1}),
+        "actions is a group of arm, leg",
+    ),
 ]
 
 
@@ -318,19 +354,22 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path, capsys, spoil, sentence
     arrays = d4rl_arrays(40)
     spoil(arrays)
     path = write_hdf5(tmp_path / "data.hdf5", arrays)
-    with pytest.raises(SystemExit, match=sentence) as stop:
+    with pytest.raises(wpc.UserError, match=sentence) as stop:
         load_dataset(path)
-    assert str(path) in stop.value.code and "\n" not in stop.value.code
+    assert "\n" not in str(stop.value)
+    assert str(path) in str(stop.value) or "0 transitions" in sentence
     assert capsys.readouterr() == ("", "")
 
 
-def test_actions_at_the_bounds_are_fine(tmp_path, capsys):
+def test_actions_at_the_bounds_are_fine(tmp_path):
     """Whatever the bounds are, and with a policy's rounding."""
     arrays = d4rl_arrays(40)
     arrays["actions"] = np.sign(arrays["actions"]) * 2.001
-    load_dataset(write_hdf5(tmp_path / "data.hdf5", arrays), max_action=2.0)
-    assert "38 transitions, with actions up to 2.001" in capsys.readouterr().out
-    with pytest.raises(SystemExit, match=r"actions up to 2\.001"):
+    path = write_hdf5(tmp_path / "data.hdf5", arrays)
+    dataset, *_ = load_dataset(path, max_action=2.0)
+    assert len(dataset["actions"]) == 38
+    assert dataset["actions"].abs().max() == pytest.approx(2.001)
+    with pytest.raises(wpc.UserError, match=r"actions from -1 to 1"):
         load_dataset(tmp_path / "data.hdf5", max_action=1.0)
 
 
@@ -340,9 +379,9 @@ def test_actions_at_the_bounds_are_fine(tmp_path, capsys):
 def reason(path):
     """Why a file can't be read: one sentence, which names the file, gives the library's
     own reason, and advises nothing."""
-    with pytest.raises(SystemExit) as stop:
+    with pytest.raises(wpc.UserError) as stop:
         load_dataset(path)
-    sentence = stop.value.code
+    sentence = str(stop.value)
     assert sentence.startswith(f"{path} can't be read: ") and "\n" not in sentence
     assert "delete" not in sentence and "damaged" not in sentence
     return sentence
@@ -407,9 +446,9 @@ def test_damaged_files(tmp_path):
         path.write_bytes(damage((plain, packed)[i % 2].read_bytes(), rng))
         try:
             dataset, *_ = load_dataset(path)
-        except SystemExit as stop:
+        except wpc.UserError as error:
             told += 1
-            assert str(path) in stop.code and "\n" not in stop.code
+            assert str(path) in str(error) and "\n" not in str(error)
         else:
             assert dataset["observations"].shape[1] == 17
             assert all(torch.isfinite(column).all() for column in dataset.values())
@@ -421,7 +460,8 @@ import time, wpc
 def peak():
     return 1024 * int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0])
 before, start = peak(), time.perf_counter()
-dataset, *_ = wpc.load_dataset({path!r}, {state_dim}, {action_dim}, 1.0, wpc.Args())
+arrays = wpc.read_dataset({path!r}, {state_dim}, {action_dim}, 1.0)
+dataset, *_ = wpc.prepare_dataset(arrays, wpc.Args())
 size = sum(column.nbytes for column in dataset.values())
 print(time.perf_counter() - start, (peak() - before) / size, len(dataset["rewards"]))
 """

@@ -4,16 +4,23 @@
 import contextlib
 import hashlib
 import http.server
+import io
 import re
 import subprocess
 import sys
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 
+import h5py
 import numpy as np
 import pytest
 from conftest import ROOT, files, refusal, wpc
 
-CONTENT = np.random.default_rng(0).bytes(300_000)
+with io.BytesIO() as buffer:
+    with h5py.File(buffer, "w") as hdf5:
+        hdf5["noise"] = np.random.default_rng(0).normal(size=40_000)
+    CONTENT = buffer.getvalue()
 TASK, NAME = "hopper-medium-replay-v2", "hopper_medium_replay-v2.hdf5"
 NOBODY = "http://127.0.0.1:9/"  # refuses connections
 DIGESTS = ROOT / "tests/data/d4rl_v2.sha256"
@@ -48,6 +55,9 @@ ANSWERS = {
     "whole": lambda h: send(h, CONTENT),
     "cut short": lambda h: send(h, CONTENT[:100_000], len(CONTENT)),
     "404": lambda h: h.send_error(404),
+    "page": lambda h: send(h, b"<html>Please sign in</html>"),
+    "half": lambda h: send(h, CONTENT[:150_000]),  # as if that were all
+    "slow": lambda h: (time.sleep(1), send(h, CONTENT)),
 }
 
 
@@ -68,6 +78,7 @@ def servers(monkeypatch, tmp_path):
 
 
 GOOD = [("whole", None), (None, "whole"), ("404", "whole"), ("cut short", "whole")]
+GOOD += [("page", "whole"), ("half", "whole")]
 
 
 @pytest.mark.parametrize("answers", GOOD)
@@ -79,13 +90,42 @@ def test_the_first_server_that_has_the_file(servers, tmp_path, answers):
     assert wpc.download_dataset(TASK).read_bytes() == CONTENT  # nobody is asked
 
 
-@pytest.mark.parametrize("answers", [(None, None), ("404", "cut short")])
+BAD = [(None, None), ("404", "cut short"), ("page", "half")]
+
+
+@pytest.mark.parametrize("answers", BAD)
 def test_no_server_has_the_file(servers, tmp_path, answers):
     servers(*answers)
     sentence = refusal(wpc, "python", "wpc.py", "--env", TASK)
     for part in (str(tmp_path / "d4rl" / NAME), "D4RL_DATASET_DIR", "--dataset"):
         assert part in sentence
-    assert NAME not in files(tmp_path / "d4rl")
+    assert not (tmp_path / "d4rl").exists() or files(tmp_path / "d4rl") == {}
+    servers("whole", None)  # and the next start finds it
+    assert wpc.download_dataset(TASK).read_bytes() == CONTENT
+
+
+def test_two_jobs_that_download_one_file(servers, tmp_path):
+    """Each writes a file of its own, so that none finds another's half."""
+    servers("slow", None)
+    with ThreadPoolExecutor(3) as pool:
+        paths = list(pool.map(wpc.download_dataset, [TASK] * 3))
+    assert [path.read_bytes() for path in paths] == [CONTENT] * 3
+    assert files(tmp_path / "d4rl") == {NAME: CONTENT}
+
+
+def test_a_file_that_another_process_has_meanwhile_is_taken(servers, tmp_path, capsys):
+    servers(None, None)
+    path = tmp_path / "d4rl" / NAME
+
+    def refuse(*_, **__):
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(CONTENT)
+        raise OSError("refused")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wpc, "urlopen", refuse)
+        assert wpc.download_dataset(TASK) == path
+    assert capsys.readouterr().out.count("downloading from") == 1
 
 
 def test_d4rls_own_folder_is_in_the_home_folder(servers, monkeypatch, tmp_path):
@@ -98,7 +138,11 @@ def test_d4rls_own_folder_is_in_the_home_folder(servers, monkeypatch, tmp_path):
     assert "D4RL_DATASET_DIR" in refusal(wpc, "python", "wpc.py", "--env", TASK)
 
 
-@pytest.mark.parametrize("name", ["ant-medium-v2", "HalfCheetah-v4", "hoper-medium-v2"])
+OTHERS = ["ant-medium-v2", "HalfCheetah-v4", "hoper-medium-v2", "hopper", "hopper-v4"]
+OTHERS += ["hopper-medium-v0", "hopper-v2"]
+
+
+@pytest.mark.parametrize("name", OTHERS)
 def test_no_server_is_asked_for_other_names(monkeypatch, capsys, name):
     monkeypatch.setattr(wpc, "download_dataset", pytest.fail)
     monkeypatch.setattr(wpc, "make_envs", pytest.fail)
@@ -106,7 +150,7 @@ def test_no_server_is_asked_for_other_names(monkeypatch, capsys, name):
     with pytest.raises(SystemExit) as stop:
         wpc.main()
     assert stop.value.code == 2
-    assert f"{name} can't be downloaded: it needs --dataset" in capsys.readouterr().err
+    assert f"--env {name} must be a task of D4RL's" in capsys.readouterr().err
 
 
 def test_names_and_digests_are_d4rls(monkeypatch, tmp_path):

@@ -107,16 +107,16 @@ gym.register("Line-v0", Line, max_episode_steps=30)
 
 @pytest.mark.parametrize("name", SPACES)
 def test_spaces_that_do_not_fit_are_refused(name):
-    with pytest.raises(SystemExit, match=SPACES[name][2]) as stop:
+    with pytest.raises(wpc.UserError, match=SPACES[name][2]) as stop:
         wpc.make_envs(f"{name}-v0", 2)
-    sentence = stop.value.code
+    sentence = str(stop.value)
     assert sentence.startswith(f"--env {name}-v0 ") and "\n" not in sentence
     assert "one-dimensional Boxes of states" in sentence
 
 
 def test_an_environment_without_a_time_limit_is_refused():
     """Its episodes may never end, and then an evaluation wouldn't, either."""
-    with pytest.raises(SystemExit, match=r"--env Endless-v0 .* a time limit.* None"):
+    with pytest.raises(wpc.UserError, match=r"--env Endless-v0 .* a time limit.* None"):
         wpc.make_envs("Endless-v0", 2)
 
 

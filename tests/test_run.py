@@ -10,6 +10,7 @@ import itertools
 import json
 import os
 import random
+import re
 import shlex
 import shutil
 import signal
@@ -19,6 +20,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -40,6 +42,7 @@ from conftest import (
     start,
     wait_until,
     wpc,
+    write_hdf5,
 )
 
 METRICS = {
@@ -61,7 +64,8 @@ def test_a_run_from_start_to_end(monkeypatch, capfd, tmp_path, name):
     assert errors == ""
     lines = output.splitlines()
     assert len(lines) == 5 and lines[0].startswith(f"to continue: {sys.executable} ")
-    assert "89,910 transitions, with actions up to 1" in lines[1]
+    assert "89,910 transitions, 0 of them terminal, with actions up to 1" in lines[1]
+    assert name == "wbc" or lines[1].endswith("alpha is 2.5")
     (run_dir,) = Path("runs").iterdir()
     assert run_dir.name.startswith(f"halfcheetah_replay__{name}__0__20")
 
@@ -101,8 +105,9 @@ def test_the_loop_is_update_after_update(tmp_path):
     """A run is what its parts give when they are called by hand."""
     line = command("wpc", "--max-timesteps", 20, "--eval-freq", 5, "--seed", 3)
     run_here(wpc, *line, "--eval-episodes", 1, "--run-dir", tmp_path)
-    args = wpc.Args(env="halfcheetah", device="cpu")
-    dataset, mean, std, _ = wpc.load_dataset(DATASET, 17, 6, 1.0, args)
+    args = wpc.Args(env="halfcheetah", dataset=str(DATASET), device="cpu")
+    arrays = wpc.read_dataset(DATASET, 17, 6, 1.0)
+    dataset, mean, std, _ = wpc.prepare_dataset(arrays, args)
     torch.manual_seed(3)
     agent = wpc.Agent(17, 6, 1.0, args)
     torch.manual_seed(3)
@@ -200,13 +205,15 @@ def test_alpha_is_the_papers_unless_given(options, alpha):
 
 
 def test_every_start_has_a_new_run_folder(script, monkeypatch):
-    clock = ["2026-01-01_00-00-01", "2026-01-01_00-00-02"]
-    monkeypatch.setattr(script.time, "strftime", lambda _: clock.pop(0))
+    """Also two in one second, or in two containers with one process number."""
+    monkeypatch.setattr(os, "getpid", lambda: 7)
     name = script.SCRIPT.stem
-    first = f"runs/hopper-medium-v2__{name}__7__2026-01-01_00-00-01_{os.getpid()}"
-    assert script.Args(seed=7).run_dir == first
-    second = f"runs/my.data__{name}__0__2026-01-01_00-00-02_{os.getpid()}"
-    assert script.Args(dataset="folder/my.data.hdf5").run_dir == second
+    folders = {script.Args(seed=7).run_dir for _ in range(100)}
+    assert len(folders) == 100
+    start = rf"runs/hopper-medium-v2__{name}__7__20\d\d-\d\d-\d\d_"
+    assert all(re.fullmatch(rf"{start}\d\d-\d\d-\d\d\.\d{{6}}", x) for x in folders)
+    other = script.Args(dataset="folder/my.data.hdf5").run_dir
+    assert other.startswith(f"runs/my.data__{name}__0__20")
 
 
 def test_the_help_explains_every_argument(script, monkeypatch, capsys):
@@ -225,8 +232,10 @@ def test_in_a_notebook(monkeypatch, capsys, tmp_path):
     importlib.reload(wpc)
     args = wpc.Args(env="halfcheetah", dataset=str(DATASET), max_timesteps=100)
     args.eval_episodes = 2
-    wpc.train(args)
+    rows = wpc.train(args)
     assert "step 100: mean_return" in capsys.readouterr().out
+    assert [row["step"] for row in rows] == [0, 100]
+    assert str(rows[1]["q"]) == read_rows(Path(args.run_dir))[1]["q"]
     assert [row["step"] for row in read_rows(Path(args.run_dir))] == ["0", "100"]
 
     args, ones = wpc.Args(), torch.ones
@@ -267,10 +276,10 @@ def test_stopped_by_ctrl_c_and_continued_with_the_command_shown(finished, tmp_pa
 
 @pytest.mark.parametrize("moment", ["before", "after"])
 def test_stopped_while_saving(monkeypatch, finished, tmp_path, moment):
-    def save(run_dir, checkpoint):
+    def save(run_dir, checkpoint, record):
         if checkpoint["step"] == 30 and moment == "before":
             raise KeyboardInterrupt
-        real_save(run_dir, checkpoint)
+        real_save(run_dir, checkpoint, record)
         if checkpoint["step"] == 30:
             raise KeyboardInterrupt
 
@@ -325,10 +334,15 @@ def test_killed_before_the_first_checkpoint(finished, run_dir):
     assert result(run_dir) == result(finished)
 
 
-def test_a_finished_run_stays_and_can_be_prolonged(run_dir, tmp_path):
-    before = result(run_dir)
-    run_here(wpc, *command("wpc", "--run-dir", run_dir))
-    assert result(run_dir) == before
+def test_a_finished_run_stays_and_can_be_prolonged(run_dir, tmp_path, capsys):
+    before, record = result(run_dir), (run_dir / "args.json").read_bytes()
+    for fewer in ([], ["--max-timesteps", 30]):
+        run_here(wpc, *command("wpc", "--run-dir", run_dir, *fewer))
+        assert (
+            f"{run_dir} is finished; raise --max-timesteps" in capsys.readouterr().out
+        )
+        assert result(run_dir) == before
+        assert (run_dir / "args.json").read_bytes() == record
     longer, whole = ["--max-timesteps", 80], tmp_path / "whole"
     run_here(wpc, *command("wpc", "--run-dir", run_dir, *longer))
     run_here(wpc, *command("wpc", "--run-dir", whole, *longer))
@@ -348,6 +362,70 @@ def test_the_data_may_move(run_dir, tmp_path):
     run_here(wpc, *command("wpc", "--run-dir", run_dir, "--dataset", moved))
 
 
+def other_data(change):
+    with h5py.File(DATASET) as file:
+        arrays = {key: file[key][:] for key in file if key != "metadata"}
+    return {key: change(key, column) for key, column in arrays.items()}
+
+
+OTHER_DATA = {
+    "other units": lambda key, x: x * 2 if key == "observations" else x,
+    "fewer rows": lambda key, x: x[:-1000],
+}
+
+
+@pytest.mark.parametrize("change", OTHER_DATA.values(), ids=OTHER_DATA)
+def test_a_run_does_not_go_on_with_other_data(run_dir, tmp_path, change):
+    """Other data would be normalized otherwise, under the same networks."""
+    path, before = tmp_path / "other.hdf5", files(run_dir)
+    write_hdf5(path, other_data(change))
+    line = command("wpc", "--run-dir", run_dir, "--dataset", path)
+    assert "was started with another dataset: choose" in refusal(wpc, *line)
+    assert files(run_dir) == before
+
+
+def test_two_runs_that_start_in_one_folder_at_once(tmp_path, monkeypatch):
+    """The second to save finds the other's checkpoint, and leaves all as it is."""
+    real_evaluate, line = wpc.evaluate, command("wpc", "--run-dir", tmp_path)
+
+    def evaluate(*arguments):
+        monkeypatch.setattr(wpc, "evaluate", real_evaluate)
+        run_here(wpc, *line, "--seed", 1)
+        return real_evaluate(*arguments)
+
+    monkeypatch.setattr(wpc, "evaluate", evaluate)
+    assert f"{tmp_path} is used by another process" in refusal(wpc, *line)
+    assert load(tmp_path)["args"]["seed"] == 1 and load(tmp_path)["step"] == 60
+    assert json.loads((tmp_path / "args.json").read_text())["seed"] == 1
+    assert len(read_rows(tmp_path)) == 3
+
+
+def test_a_continued_run_draws_other_numbers_on_a_gpu(run_dir, monkeypatch):
+    """There, the generator starts from a seed, which must not be the first one."""
+    seeds, real_seed = [], torch.manual_seed
+    monkeypatch.setattr(torch, "manual_seed", lambda x: seeds.append(x) or real_seed(x))
+    line = command("wpc", "--run-dir", run_dir, "--seed", 0, "--max-timesteps", 61)
+    run_here(wpc, *line)
+    assert seeds == [0, 0, 60]
+
+
+def test_a_sweep_outlives_its_trials(tmp_path, monkeypatch):
+    """A trial that fails raises an exception, and leaves no file open."""
+    monkeypatch.chdir(tmp_path)
+    options = {"dataset": str(DATASET), "max_timesteps": 4, "eval_freq": 2}
+    options |= {"eval_episodes": 1, "device": "cpu", "batch_size": 8}
+    ends, opened = [], []
+    for critic_lr in (1e30, 3e-4, 3e-4):
+        try:
+            rows = wpc.train(wpc.Args("halfcheetah", critic_lr=critic_lr, **options))
+            ends.append([row["step"] for row in rows])
+        except Exception as error:
+            ends.append(type(error))
+        opened.append(len(os.listdir("/proc/self/fd")))
+    assert ends == [wpc.UserError, [0, 2, 4], [0, 2, 4]]
+    assert opened[1] == opened[2] and len(list(Path("runs").iterdir())) == 3
+
+
 def test_a_run_of_a_gpu_goes_on_without_one(run_dir):
     checkpoint = load(run_dir)
     checkpoint["args"]["device"] = "cuda"
@@ -357,11 +435,11 @@ def test_a_run_of_a_gpu_goes_on_without_one(run_dir):
 
 
 CONTRADICTIONS = [
-    ("wpc", ["--seed", 1], "began with another script or seed"),
-    ("wpc", ["--alpha", 1.0], "began with another script or alpha"),
-    ("wpc", ["--batch-size", 32], "began with another script or batch_size"),
-    ("td3_bc", [], "began with another script or "),
-    ("wbc", [], "began with another script or "),
+    ("wpc", ["--seed", 1], "was started with another seed: choose"),
+    ("wpc", ["--alpha", 1.0], "was started with another alpha: choose"),
+    ("wpc", ["--batch-size", 32], "was started with another batch_size: choose"),
+    ("td3_bc", [], "was started with another value_lr: choose"),
+    ("wbc", [], "was started with another weight: choose"),
 ]
 
 
@@ -375,5 +453,6 @@ def test_what_contradicts_the_run_is_refused(run_dir, name, arguments, sentence)
 def test_a_run_of_td3_bc_is_not_for_the_others(tmp_path):
     line = ["--max-timesteps", 1, "--run-dir", tmp_path]
     run_here(SCRIPTS["td3_bc"], *command("td3_bc", *line))
-    for name in ("wpc", "wbc"):
-        assert "value_lr" in refusal(SCRIPTS[name], *command(name, *line))
+    for name, other in (("wpc", "weight"), ("wbc", "alpha")):
+        sentence = f"was started with another {other}"
+        assert sentence in refusal(SCRIPTS[name], *command(name, *line))

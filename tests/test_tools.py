@@ -471,7 +471,8 @@ def make(tmp_path, monkeypatch):
 def assert_nothing_is_lost(path, dataset, state_dim, action_dim):
     """The scripts make Minari's transitions of the file, and know its episodes."""
     args = wpc.Args(env="hopper", weight="static")
-    data, mean, std, _ = wpc.load_dataset(path, state_dim, action_dim, 2.0, args)
+    arrays = wpc.read_dataset(path, state_dim, action_dim, 2.0)
+    data, mean, std, _ = wpc.prepare_dataset(arrays, args)
     for key in ("observations", "next_observations"):
         data[key] = data[key] * std + mean
     keys = ("observations", "actions", "rewards", "next_observations", "terminals")
@@ -526,7 +527,8 @@ def test_no_transition_is_lost_if_all_episodes_are_terminal(tmp_path, make):
     name = make(*(buffer(i, 3 + i, True) for i in range(3)))
     convert(name, tmp_path / "data.hdf5")
     args = wpc.Args(env="hopper")
-    data, *_ = wpc.load_dataset(tmp_path / "data.hdf5", 3, 1, 2.0, args)
+    arrays = wpc.read_dataset(tmp_path / "data.hdf5", 3, 1, 2.0)
+    data, *_ = wpc.prepare_dataset(arrays, args)
     rewards = np.concatenate([buffer(i, 3 + i).rewards for i in range(3)])
     assert data["rewards"].ravel().tolist() == np.float32(rewards).tolist()
     assert data["terminals"].sum() == 3

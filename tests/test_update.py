@@ -362,3 +362,22 @@ def test_random_weight_is_a_new_permutation_each_time():
     draws = [other_weight(weight="random").flatten().tolist() for _ in range(8)]
     assert all(sorted(draw) == [0] * 4 + [1] * 4 for draw in draws)
     assert len({tuple(draw) for draw in draws}) > 4
+
+
+def test_columns_of_one_axis_are_not_broadcast(script):
+    """Rewards (B,) would make targets (B, B)."""
+    args = script.Args(device="cpu")
+    for name in ("rewards", "terminals"):
+        batch = {key: torch.ones(4, 3) for key in ("observations", "next_observations")}
+        batch |= {"actions": torch.ones(4, 1), "rewards": torch.ones(4, 1)}
+        batch |= {"terminals": torch.zeros(4, 1)}
+        batch[name] = batch[name][:, 0]
+        with pytest.raises(AssertionError, match=r"must be \(B, 1\)"):
+            script.Agent(3, 1, 1.0, args).update(batch, 2)
+
+
+def test_a_new_weight_without_lines_of_its_own_says_so():
+    with pytest.raises(AssertionError, match="other_weight has no lines for mine"):
+        wpc.other_weight(
+            torch.ones(2, 1), torch.ones(2, 1), {}, wpc.Args(weight="mine")
+        )

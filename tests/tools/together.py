@@ -214,7 +214,7 @@ def system(args):
 
 class Runs:
     """R runs that are trained as one. `dims` has each run's (state_dim, action_dim,
-    max_action), `data` what load_dataset returns."""
+    max_action), `data` what prepare_dataset returns."""
 
     def __init__(self, runs, dims, data, device):
         self.runs, self.dims, self.data, self.device = runs, dims, data, device
@@ -442,7 +442,8 @@ def load(runs, device):
             # With the static weight's column, whether a run needs it or not
             options = wpc.Args(args.env, path, discount=args.discount, device="cpu")
             options.weight = "static"
-            data[path] = wpc.load_dataset(path, *dims[args.env], options)
+            arrays = wpc.read_dataset(path, *dims[args.env])
+            data[path] = wpc.prepare_dataset(arrays, options)
     if len({max_action for _, _, max_action in dims.values()}) > 1:
         sys.exit("the robots' actions must all have the same bounds")
     own_dims = [dims[args.env] for args in runs]
