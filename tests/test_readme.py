@@ -24,10 +24,10 @@ import torch
 import tyro
 from scipy import stats
 
-import wpc
-
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests/tools")]
+import wpc  # noqa: E402
+
 README = (ROOT / "README.md").read_text()
 RESULTS = (ROOT / "tests/results/README.md").read_text()
 TABLES = (ROOT / "tests/results/tables.md").read_text()
@@ -103,6 +103,10 @@ def test_its_first_table_is_a_part_of_them():
     rows = [row for row in rows_of(RESULTS, "Scores") if row[0].endswith("-medium")]
     ours = rows_of(README, None)
     assert ours == [[row[0], *row[2:6]] for row in rows[:3]] and len(ours) == 3
+    for row in rows_of(TABLES, "Table 1")[:3]:
+        steps = "500k" if row[0] == "halfcheetah-medium" else "1,000k"
+        assert row[2].endswith(f"; {steps})") and row[4].endswith(f"; {steps})")
+    assert "Runs have 1,000,000 steps, on HalfCheetah 500,000." in README
 
 
 def leads():
@@ -125,6 +129,11 @@ def test_its_differences_are_the_reports():
     assert {(task, over): tuple(cells) for task, over, *cells in rows} == expected
     assert float(expected["walker2d-medium", "TD3+BC"][2]) > 0.05
     assert "On *walker2d-medium* the lead over TD3+BC could be chance" in RESULTS
+    (row,) = (x for x in rows_of(TABLES, "Table 1") if x[0] == "walker2d-medium")
+    papers = float(row[3]) - float(row[5])
+    low, high = leads()["walker2d-medium", "TD3+BC"][1:3]
+    assert float(low) < 0 < papers < float(high)
+    assert f"consistent with the paper's {papers:.1f} and with none" in RESULTS
     hopper, walker = (
         float(expected[f"{robot}-medium", "TD3+BC"][2])
         for robot in ("hopper", "walker2d")
@@ -138,6 +147,24 @@ def test_one_seed_is_why_wbc_is_ahead_at_step_500_000():
     then = values[:, (steps > 400_000) & (steps <= 500_000)].mean(axis=1)
     assert sorted(then > 79.9) == [False, True, True]
     assert "because one seed of wPC has yet to recover" in RESULTS
+
+
+def test_its_steps_are_those_of_the_runs():
+    for task, _, *cells in rows_of(TABLES, "Table 1"):
+        for i, usual in {0: "1,000k", 2: "1,000k", 5: "500k", 7: "200k"}.items():
+            shorter = task == "halfcheetah-medium" and i < 5
+            if cells[i] != "-":
+                assert cells[i].endswith(f"; {'500k' if shorter else usual})")
+    sentence = "those of BC (`td3_bc.py --alpha 0`) 200,000."
+    sentence = f"Those of wBC and on *halfcheetah-medium* have 500,000, {sentence}"
+    assert f"Runs have 1,000,000 steps. {sentence}" in RESULTS
+
+
+def test_its_float32_run_ends_where_it_says():
+    path = "float32/wpc__hopper-medium__0/evaluations.csv"
+    table = np.genfromtxt(ROOT / "tests/results" / path, names=True, delimiter=",")
+    end = table["normalized_score"][-10:].mean()
+    assert f"[ends at {end:.1f}]({path})" in RESULTS
 
 
 def arguments(script, words):
@@ -448,7 +475,7 @@ def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
     assert count == 9 and len(below) == 6
     text = f"{min(below):.0f} to {max(below):.0f} below its scores"
     assert f"the single seeds agree with the paper's order, {text}" in RESULTS
-    assert "The order is the paper's, the scores are lower." in README
+    assert "the order is the paper's, the scores are lower." in README
     for text in (README, RESULTS):
         assert "all three algorithms score within 3 points of the paper" in text
 
@@ -491,7 +518,10 @@ def test_its_hours_are_those_of_the_measured_speeds():
             speed = ratios[name][column] * int(textbook[column])
             cells.append(f"{speed:.0f}/s, {1e6 / speed / 3600:.1f} hours")
         assert f"\n| {machine}, one core | {cells[0]} | {cells[1]} |\n" in README
-    slow, fast = re.search(r"\| NVIDIA H200 \| (\d+) to (\d+)/s \|", README).groups()
+    row = re.search(r"\| NVIDIA H200 \| (\d+) to (\d+)/s, (.*?) \|", README)
+    slow, fast, hours = row.groups()
+    least, most = (1e6 / int(speed) / 3600 for speed in (fast, slow))
+    assert hours == f"{least:.1f} to {most:.1f} hours"
     assert f"it makes {slow} to {fast} steps a second." in RESULTS
     speed = "made 2,927 steps a second each"
     assert speed in README and speed in RESULTS
