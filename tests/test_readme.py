@@ -106,7 +106,7 @@ def test_its_first_table_is_a_part_of_them():
     for row in rows_of(TABLES, "Table 1")[:3]:
         steps = "500k" if row[0] == "halfcheetah-medium" else "1,000k"
         assert row[2].endswith(f"; {steps})") and row[4].endswith(f"; {steps})")
-    assert "Runs have 1,000,000 steps, on HalfCheetah 500,000." in README
+    assert "trained for 1,000,000 steps, on HalfCheetah for 500,000, on" in README
 
 
 def leads():
