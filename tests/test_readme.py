@@ -1,27 +1,35 @@
 # SPDX-License-Identifier: MIT
-"""What the README shows is what the code does.
+"""What README.md and tests/results/README.md say is what the code and the runs do.
 
 After a change of wpc.py, this writes the lines of the README's map anew:
 
     python tests/test_readme.py
 """
 
+import csv
 import importlib
+import itertools
 import json
 import re
 import shlex
 import subprocess
 import sys
+import textwrap
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import tyro
 from scipy import stats
 
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests/tools")]
+import wpc  # noqa: E402
+
 README = (ROOT / "README.md").read_text()
+RESULTS = (ROOT / "tests/results/README.md").read_text()
 TABLES = (ROOT / "tests/results/tables.md").read_text()
 MAP_ROW = re.compile(r"^\| (.*) \| \[\d+\]\(wpc\.py#L\d+\) \|$", re.M)
 MAP = {  # what the paper has, and how the line of wpc.py begins that does it
@@ -39,7 +47,8 @@ MAP = {  # what the paper has, and how the line of wpc.py begins that does it
     "the policy's objective, eq. 6": "actor_loss = -lmbda * q_pi.mean() + constraint",
     "targets follow": "soft_update(self.critic_target, self.critic, args.tau)",
 }
-WORDS = 1_500
+DATA = str(ROOT / "tests/data/halfcheetah_replay.hdf5")
+WORDS = 1_200  # beside tables and code
 
 
 def map_row(paper):
@@ -64,7 +73,7 @@ def changes(text):
 
 
 def test_the_diff_is_part_of_the_real_one():
-    (shown,) = re.findall(r"```diff\n(.*?)```", README, re.S)
+    shown = re.findall(r"```diff\n(.*?)```", README, re.S)[0]
     line = ["diff", "td3_bc.py", "wpc.py"]
     output = subprocess.run(line, cwd=ROOT, capture_output=True, text=True).stdout
     real = changes(output)
@@ -74,57 +83,88 @@ def test_the_diff_is_part_of_the_real_one():
 
 
 def rows_of(text, title):
-    """The cells of the rows on D4RL's tasks in a section's table."""
-    section = text.split(f"## {title}\n")[1].split("\n## ")[0]
+    """The cells of the rows on D4RL's tasks in a section's tables; None: the first."""
+    section = text if title is None else text.split(f"## {title}\n")[1]
+    section = section.split("\n## ")[0]
     lines = re.findall(r"^\| [a-z0-9]+-medium.*", section, re.M)
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
 
 
 def test_its_results_are_the_reports():
-    ours, theirs = rows_of(README, "Results"), rows_of(TABLES, "Table 1")
-    assert len(ours) == len(theirs)
+    ours, theirs = rows_of(RESULTS, "Scores"), rows_of(TABLES, "Table 1")[:6]
+    ours = ours[: len(theirs)]
+    assert len(ours) == 6
     for row, cells in zip(ours, theirs, strict=True):
         cells = ["" if x == "-" else re.sub(r"; [\d,]+k\)", ")", x) for x in cells]
         assert [x.strip("*") for x in row] == cells[: len(row)]
-    cells = {row[0]: [x.split(" (")[0] for x in row] for row in theirs}
-    wpc, wpc_paper, td3_bc, td3_bc_paper = cells["hopper-medium"][2:6]
-    assert f"wPC has {wpc} (three seeds; the paper {wpc_paper})" in README
-    assert f"and TD3+BC {td3_bc} ({td3_bc_paper}), on" in README
-    wpc, wpc_paper, td3_bc, td3_bc_paper = cells["walker2d-medium"][2:6]
-    assert f" {wpc} ({wpc_paper}) and {td3_bc} ({td3_bc_paper}), where" in README
+
+
+def test_its_first_table_is_a_part_of_them():
+    rows = [row for row in rows_of(RESULTS, "Scores") if row[0].endswith("-medium")]
+    ours = rows_of(README, None)
+    assert ours == [[row[0], *row[2:6]] for row in rows[:3]] and len(ours) == 3
+    for row in rows_of(TABLES, "Table 1")[:3]:
+        steps = "500k" if row[0] == "halfcheetah-medium" else "1,000k"
+        assert row[2].endswith(f"; {steps})") and row[4].endswith(f"; {steps})")
+    assert "trained for 1,000,000 steps, on HalfCheetah for 500,000, on" in README
+
+
+def leads():
+    """The report's differences: {(task, over): (lead, low, high, p, seeds; steps)}."""
+    cell = re.compile(r"(\S+) \[(\S+), (\S+)\], p = (\S+) \((.*)\)")
+    rows = rows_of(TABLES, "Differences")
+    return {
+        (task, over): cell.fullmatch(text).groups()
+        for task, *texts in rows
+        for over, text in zip(("TD3+BC", "wBC"), texts, strict=True)
+    }
 
 
 def test_its_differences_are_the_reports():
-    table = rows_of(TABLES, "Differences")
-    rows = {task: cell for task, cell, _ in table}
-    pattern = r"(\S+) \[(\S+), (\S+)\], p = (\S+)"
-    mean, low, high, p = re.match(pattern, rows["hopper-medium"]).groups()
-    interval = f"95% interval {low} to {high}, p = {float(p):.1g}"
-    assert (
-        f"is {mean} on *hopper-medium* ({interval}, Welch's t test, uncorrected)"
-        in README
+    rows = [row for row in rows_of(RESULTS, "Scores") if row[1] in ("TD3+BC", "wBC")]
+    expected = {
+        key: (lead, f"{low} to {high}", p, seeds)
+        for key, (lead, low, high, p, seeds) in leads().items()
+    }
+    assert {(task, over): tuple(cells) for task, over, *cells in rows} == expected
+    assert float(expected["walker2d-medium", "TD3+BC"][2]) > 0.05
+    assert "On *walker2d-medium* the lead over TD3+BC could be chance" in RESULTS
+    (row,) = (x for x in rows_of(TABLES, "Table 1") if x[0] == "walker2d-medium")
+    papers = float(row[3]) - float(row[5])
+    low, high = leads()["walker2d-medium", "TD3+BC"][1:3]
+    assert float(low) < 0 < papers < float(high)
+    assert f"consistent with the paper's {papers:.1f} and with none" in RESULTS
+    hopper, walker = (
+        float(expected[f"{robot}-medium", "TD3+BC"][2])
+        for robot in ("hopper", "walker2d")
     )
-    mean, low, high, p = re.match(pattern, rows["halfcheetah-medium"]).groups()
-    interval = f"{low} to {high}, p = {float(p):.1g}"
-    assert f"two seeds, {mean} on *halfcheetah-medium* ({interval})" in README
-    assert "(2, 2;" in rows["halfcheetah-medium"]
-    mean, low, high, p = re.match(pattern, rows["walker2d-medium"]).groups()
-    assert f"it is {mean} ({low} to {high}, p = {p})" in README
-    assert f"where the lead could be chance (p = {p})" in README
-    over_wbc = {task: cell for task, _, cell in table}
-    cells = [over_wbc[f"{robot}-medium"] for robot in ("hopper", "halfcheetah")]
-    cells.append(over_wbc["walker2d-medium"])
-    seeds = ["(3, 3; 500k)", "(2, 2; 500k)", "(3, 3; 500k)"]
-    assert [cell[-12:] for cell in cells] == seeds
-    numbers = []
-    for cell in cells:
-        mean, low, high, p = re.match(pattern, cell).groups()
-        numbers += [mean, f"({low} to {high}, p = {p})"]
-    assert (
-        "Its lead over wBC at step 500,000 is {} on *hopper-medium* {}, {} with two "
-        "seeds on *halfcheetah-medium* {} and, with one seed of wPC yet to recover, {} "
-        "on *walker2d-medium* {}."
-    ).format(*numbers) in README
+    assert f"is clear on *hopper-medium* (p = {hopper:.1g}, Welch's t" in README
+    assert f"could be chance on *walker2d-medium* (p = {walker:.2f})" in README
+
+
+def test_one_seed_is_why_wbc_is_ahead_at_step_500_000():
+    steps, values = scores("wpc", "walker2d-medium")
+    then = values[:, (steps > 400_000) & (steps <= 500_000)].mean(axis=1)
+    assert sorted(then > 79.9) == [False, True, True]
+    assert "because one seed of wPC has yet to recover" in RESULTS
+
+
+def test_its_steps_are_those_of_the_runs():
+    for task, _, *cells in rows_of(TABLES, "Table 1"):
+        for i, usual in {0: "1,000k", 2: "1,000k", 5: "500k", 7: "200k"}.items():
+            shorter = task == "halfcheetah-medium" and i < 5
+            if cells[i] != "-":
+                assert cells[i].endswith(f"; {'500k' if shorter else usual})")
+    sentence = "those of BC (`td3_bc.py --alpha 0`) 200,000."
+    sentence = f"Those of wBC and on *halfcheetah-medium* have 500,000, {sentence}"
+    assert f"Runs have 1,000,000 steps. {sentence}" in RESULTS
+
+
+def test_its_float32_run_ends_where_it_says():
+    path = "float32/wpc__hopper-medium__0/evaluations.csv"
+    table = np.genfromtxt(ROOT / "tests/results" / path, names=True, delimiter=",")
+    end = table["normalized_score"][-10:].mean()
+    assert f"[ends at {end:.1f}]({path})" in RESULTS
 
 
 def arguments(script, words):
@@ -146,12 +186,14 @@ def test_the_runs_have_the_arguments_of_their_commands():
     assert sorted(folders) == sorted((ROOT / "tests/results/runs").iterdir())
 
 
-COMMANDS = re.findall(r"(?<=\.venv/bin/python )[a-z0-9_/]+\.py [^\n`]+", README)
+COMMANDS = re.findall(
+    r"(?<=\.venv/bin/python )[a-z0-9_/]+\.py [^\n`]+", README + RESULTS
+)
 
 
-@pytest.mark.parametrize("line", [x for x in COMMANDS if "[...]" not in x])
+@pytest.mark.parametrize("line", COMMANDS)
 def test_its_commands_are_understood(line):
-    script, *words = shlex.split(line.removesuffix(" ..."))
+    script, *words = shlex.split(line.replace("$SLURM_ARRAY_TASK_ID", "3"))
     if script == "tests/tools/compiled.py":
         script, *words = words
     if script == "tests/tools/experiments.py":
@@ -160,11 +202,183 @@ def test_its_commands_are_understood(line):
         arguments(script, words)
 
 
-def test_its_program_plays_a_run(finished):
-    (program,) = re.findall(r"```python\n(.*?)```", README, re.S)
+def block(kind, words):
+    """The README's one block of code of a kind that holds these words."""
+    blocks = re.findall(rf"```{kind}\n(.*?)```", README, re.S)
+    (code,) = (x for x in blocks if words in x)
+    return code
+
+
+def replaced(code, replacements):
+    """The code after replacements, each of something that stands there once."""
+    for old, new in replacements.items():
+        assert code.count(old) == 1, old
+        code = code.replace(old, new)
+    return code
+
+
+def test_its_smallest_install_is_the_block_for_training():
+    (line,) = re.findall(r"pip install -r <\((.*)\)$", README, re.M)
+    output = subprocess.run(
+        shlex.split(line), cwd=ROOT, capture_output=True, text=True
+    ).stdout
+    block = (ROOT / "requirements.txt").read_text().split("\n\n")[0]
+    assert output.strip() == block and block.startswith("# training\n")
+
+
+def test_it_names_the_versions_that_it_was_tried_with():
+    text = (ROOT / "requirements.txt").read_text()
+    mujoco, pytorch = (
+        re.search(rf"^{name}==(\S+)", text, re.M)[1] for name in ("mujoco", "torch")
+    )
+    assert f"It was tried with MuJoCo {mujoco} and PyTorch {pytorch}." in README
+
+
+def test_its_command_to_download_gives_d4rls_file(monkeypatch, tmp_path):
+    (program,) = re.findall(r'python -c "(.*)"$', README, re.M)
+    (tmp_path / "hopper_medium-v2.hdf5").write_text("")  # there is no network here
+    monkeypatch.setenv("D4RL_DATASET_DIR", str(tmp_path))
     names = {}
-    exec(program.replace("RUN_DIR", str(finished)), names)
+    exec(program.replace("wpc.download", "path = wpc.download"), names)
+    assert Path(names["path"]) == tmp_path / "hopper_medium-v2.hdf5"
+
+
+def test_its_columns_are_those_of_a_run(finished):
+    (table,) = re.findall(r"^\| column \|.*?\n\n", README, re.S | re.M)
+    names = [
+        re.findall(r"`(\w+)`", line.split("|")[1]) for line in table.split("\n")[2:-2]
+    ]
+    with (finished / "evaluations.csv").open() as file:
+        header, *_ = csv.reader(file)
+    assert sorted(itertools.chain(*names)) == sorted(header)
+
+
+def test_its_program_plays_a_run(finished):
+    names = {}
+    exec(block("python", "RUN_DIR").replace("RUN_DIR", str(finished)), names)
     assert names["observations"].shape == (1, 17) and names["rewards"].shape == (1,)
+
+
+def test_its_sweep_goes_on_after_a_run_that_fails(monkeypatch, tmp_path, capsys):
+    program = replaced(
+        block("python", "UserError"),
+        {
+            'env="hopper-medium-v2"': f'env="halfcheetah", dataset={DATA!r}, **SHORT',
+            "(1.0, 2.5, 5.0)": "(1e38, 2.5, 5.0)",
+        },
+    )
+    short = {"max_timesteps": 4, "eval_freq": 2, "eval_episodes": 1, "device": "cpu"}
+    monkeypatch.chdir(tmp_path)
+    exec(program, {"SHORT": short})
+    lines = capsys.readouterr().out.splitlines()
+    means = [x.split() for x in lines if re.fullmatch(r"[25]\.\d \S+", x)]
+    assert [x[0] for x in means] == ["2.5", "5.0"]
+    assert len(list((tmp_path / "runs").iterdir())) == 3
+
+
+def changed_script(words, folder, name):
+    """wpc.py after the changes of the README's diff that holds these words, imported.
+
+    A hunk's first lines (-) are replaced by its others (+), wherever they are indented.
+    """
+    lines = (ROOT / "wpc.py").read_text().splitlines()
+    hunks = re.findall(r"((?:^-.*\n)+)((?:^\+.*\n)+)", block("diff", words), re.M)
+    assert hunks
+    for hunk in hunks:
+        old, new = ([x[1:] for x in part.splitlines()] for part in hunk)
+        old, new = (textwrap.dedent("\n".join(x)).splitlines() for x in (old, new))
+        places = []
+        for start in range(len(lines) - len(old) + 1):
+            found = lines[start : start + len(old)]
+            if textwrap.dedent("\n".join(found)).splitlines() == old:
+                places.append(start)
+        assert len(places) == 1, f"{old} stands {len(places)} times in wpc.py"
+        (start,) = places
+        first = lines[start]
+        indent = first[: len(first) - len(first.lstrip())]
+        lines[start : start + len(old)] = [indent + x for x in new]
+    path = folder / f"{name}.py"
+    path.write_text("\n".join(lines) + "\n")
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # where dataclasses look it up
+    spec.loader.exec_module(module)
+    return module
+
+
+def short_run(module, folder, **options):
+    """A few steps, and a few more after continuing; returns the checkpoint."""
+    for steps in (4, 8):
+        args = module.Args(
+            env="halfcheetah",
+            dataset=DATA,
+            device="cpu",
+            max_timesteps=steps,
+            eval_freq=2,
+            eval_episodes=1,
+            run_dir=str(folder / "run"),
+            **options,
+        )
+        module.train(args)
+    return torch.load(folder / "run/checkpoint.pt", weights_only=True)
+
+
+def test_its_change_for_another_weight_works(tmp_path):
+    module = changed_script("torch.sigmoid", tmp_path, "wpc_with_another_weight")
+    checkpoint = short_run(module, tmp_path)
+    assert 0.4 < checkpoint["evaluations"][-1]["weight"] < 0.6  # about half at first
+    mean = {row.get("weight") for row in checkpoint["evaluations"]} - {None}
+    assert all(abs(x * 256 - round(x * 256)) > 1e-4 for x in mean)  # not 0 or 1
+
+
+def test_its_change_for_five_critics_works(tmp_path):
+    module = changed_script("class Critic", tmp_path, "wpc_with_five_critics")
+    checkpoint = short_run(module, tmp_path)
+    assert len(checkpoint["agent"]["critic"]) == 5 * 6  # weights and biases of 3 layers
+    args = module.Args(device="cpu")
+    agent = module.Agent(11, 3, 1.0, args)
+    before = [p.clone() for p in agent.critic.parameters()]
+    batch = {
+        "observations": torch.randn(9, 11),
+        "next_observations": torch.randn(9, 11),
+    }
+    batch |= {"actions": torch.rand(9, 3), "rewards": torch.randn(9, 1)}
+    agent.update(batch | {"terminals": torch.zeros(9, 1)}, 1)
+    after = list(agent.critic.parameters())
+    assert all((x != y).any() for x, y in zip(before, after, strict=True))
+
+
+def test_its_change_for_another_logger_works(monkeypatch, tmp_path):
+    logged, configs = {}, []
+    wandb = types.SimpleNamespace(
+        init=lambda config: configs.append(config),
+        log=lambda row, step: logged.update({step: row}),
+    )
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    module = changed_script("import wandb", tmp_path, "wpc_with_another_logger")
+    checkpoint = short_run(module, tmp_path)
+    assert [config["max_timesteps"] for config in configs] == [4, 8]
+    assert logged == {row["step"]: row for row in checkpoint["evaluations"]}
+
+
+def test_its_program_trains_on_data_in_memory(capsys):
+    names = {}
+    exec(block("python", "in memory"), names)
+    assert "normalized_score" in capsys.readouterr().out.splitlines()[-1]
+    assert names["step"] == 100
+    assert all(p.isfinite().all() for p in names["agent"].critic.parameters())
+
+
+def test_its_program_writes_data_that_train(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    program = replaced(block("python", "h5py"), {"10_000": "1_000"})
+    exec(program, {})
+    (line,) = (x for x in COMMANDS if "--dataset pendulum.hdf5" in x)
+    _, *words = shlex.split(line)
+    options = shlex.split("--max-timesteps 4 --eval-freq 2 --run-dir run")
+    wpc.train(tyro.cli(wpc.Args, args=words + options))
+    checkpoint = torch.load("run/checkpoint.pt", weights_only=True)
+    assert len(checkpoint["mean"]) == 3
 
 
 def tables(script, task):
@@ -189,11 +403,17 @@ def test_what_it_says_of_curves_is_in_the_runs():
             early.append(f"{values[:, steps <= 100_000].mean():.1f}")
         steps, values = scores(script, "hopper-medium-replay")
         jumps.append(np.abs(np.diff(values[:, steps > 500_000])))
-    first = "wPC averages {} on *hopper-medium* and {} on *walker2d-medium*, TD3+BC {} "
-    assert (first + "and {}.").format(*early) in README
+    for task, ours, td3_bc in zip(
+        ("hopper-medium", "walker2d-medium"), early[:2], early[2:], strict=True
+    ):
+        assert f"\n| {task} | {ours} | {td3_bc} |\n" in RESULTS
+        assert float(ours) < 0.7 * float(td3_bc)  # far below
+    sentence = "over the first 100,000 steps on *hopper-medium* and *walker2d-medium*, "
+    assert sentence + "it scores far below TD3+BC" in README
     ours, td3_bc = (f"{np.median(x):.0f}" for x in jumps)
-    most = f"by {max(x.max() for x in jumps):.0f} at most"
-    assert f"by {td3_bc} (TD3+BC) and {ours} points (wPC)" in README and most in README
+    most = max(x.max() for x in jumps)
+    sentence = "is {} points (TD3+BC) and {} (wPC), the largest {:.0f}."
+    assert sentence.format(td3_bc, ours, most) in RESULTS
 
 
 def test_its_last_evaluations_are_in_the_runs():
@@ -202,7 +422,7 @@ def test_its_last_evaluations_are_in_the_runs():
         for script in ("wpc", "td3_bc")
     )
     sentence = "By last evaluations, the paper's measure, *hopper-medium* has {} (wPC)"
-    assert (sentence + " and {} (TD3+BC).").format(*last) in README
+    assert (sentence + " and {} (TD3+BC).").format(*last) in RESULTS
 
 
 def test_what_it_says_of_q_running_away_is_in_the_runs():
@@ -210,17 +430,20 @@ def test_what_it_says_of_q_running_away_is_in_the_runs():
     ratios = [x["q"] / x["best_discounted_return"] for x in runs]
     largest = sorted(f"{ratio.max():.1f}" for ratio in ratios)
     steps = [x["step"][r.argmax()] for x, r in zip(runs, ratios, strict=True)]
-    assert "it reached {}, {} and {} times the best".format(*largest) in README
-    assert f"at steps {min(steps):,.0f} to {max(steps):,.0f}" in README
+    assert "\n| {} | {} | {} |\n".format(*largest) in RESULTS
+    assert f"at steps {min(steps):,.0f} to {max(steps):,.0f}" in RESULTS
+    assert [ratio.max() > 1 for ratio in ratios].count(True) == 2
+    assert all(ratio[-10:].mean() < 1 for ratio in ratios)
+    assert "Q can run away and come back, as it did with two seeds on *walk" in README
 
     (long,) = (x for x, r in zip(runs, ratios, strict=True) if r.max() > 5)
     early = long["step"] <= 600_000
     below = long["normalized_score"] < 40
     assert below[early].mean() > 0.9 and below[~early].mean() < 0.1
-    assert "the score was mostly below 40 until step 600,000" in README
+    assert "the score was mostly below 40 until step 600,000" in RESULTS
     ends = [x["normalized_score"][-10:].mean() for x in runs]
     lowest, highest = np.floor(min(ends)), np.ceil(max(ends))
-    assert f"all three seeds end between {lowest:.0f} and {highest:.0f}" in README
+    assert f"All three seeds end between {lowest:.0f} and {highest:.0f}." in RESULTS
 
 
 def test_there_is_one_run_of_each_other_weight_or_alpha():
@@ -229,8 +452,8 @@ def test_there_is_one_run_of_each_other_weight_or_alpha():
         "wpc-alpha-1.0__walker2d-medium__1",
         "wpc-exponential__walker2d-medium__0",
     ]
-    assert "other weights and alphas ([one run each]" in README
-    assert "of wPC-e and alpha 1.0)" in README
+    assert "other weights and alphas, of which there is [one run each]" in RESULTS
+    assert "of wPC-e and alpha 1.0." in RESULTS
 
 
 def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
@@ -251,26 +474,57 @@ def test_all_medium_scores_are_as_near_to_the_papers_as_it_says():
             assert float(cells["wPC, paper"]) > float(cells["TD3+BC, paper"])
     assert count == 9 and len(below) == 6
     text = f"{min(below):.0f} to {max(below):.0f} below its scores"
-    assert f"the single seeds agree with the paper's order, {text}" in README
-    assert "all three algorithms score within 3 points of the paper" in README
+    assert f"the single seeds agree with the paper's order, {text}" in RESULTS
+    assert "the order is the paper's, the scores are lower." in README
+    for text in (README, RESULTS):
+        assert "all three algorithms score within 3 points of the paper" in text
 
 
 def test_td3_bc_is_as_near_to_its_curves_on_d4rls_files_as_it_says():
-    rows = rows_of(TABLES, "TD3+BC here and on D4RL's files")
-    rows = [row for row in rows if row[0].endswith("-medium")]
-    assert len(rows) == 3
-    for _, ours, theirs, _ in rows:
-        assert abs(float(ours.split()[0]) - float(theirs.split()[0])) <= 1
-    assert "TD3+BC's mean over all evaluations is within a point of" in README
-    sentence = "p = {} with two of our seeds, {} and {} with three"
-    assert sentence.format(*(row[3] for row in rows)) in README
-    assert [row[1].split("(")[1][0] for row in rows] == ["2", "3", "3"]
-    below = [
-        float(theirs.split()[0]) - float(ours.split()[0])
-        for task, ours, theirs, _ in rows_of(TABLES, "TD3+BC here and on D4RL's files")
-        if task.endswith("-medium-replay")
-    ]
-    assert "it is {:.0f}, {:.0f} and {:.0f} points below".format(*below) in README
+    lines, apart = [], {"medium": [], "medium-replay": []}
+    for task, ours, theirs, p in rows_of(TABLES, "TD3+BC here and on D4RL's files"):
+        seeds = re.search(r"\((\d)", ours)[1]
+        difference = float(ours.split()[0]) - float(theirs.split()[0])
+        lines.append([task, seeds, f"{difference:.1f}", p.strip("-")])
+        apart[task.split("-", 1)[1]].append(difference)
+    assert rows_of(RESULTS, "The data") == lines and len(lines) == 6
+    assert max(abs(x) for x in apart["medium"]) <= 1
+    assert "our mean over all evaluations is within a point of theirs" in RESULTS
+    assert "its mean over all evaluations is within a point of theirs" in README
+    least, most = -max(apart["medium-replay"]), -min(apart["medium-replay"])
+    assert f"a single seed is {least:.0f} to {most:.0f} points below" in RESULTS
+
+
+def test_its_replay_data_of_hopper_is_as_small_as_it_says():
+    with (ROOT / "tests/results/datasets.csv").open() as file:
+        rows = {row["task"]: row for row in csv.DictReader(file)}
+    ours = int(rows["hopper-medium-replay"]["transitions"])
+    assert f"Hopper's has {ours:,} transitions where D4RL's has" in RESULTS
+    assert {
+        int(rows[f"{x}-medium"]["transitions"]) for x in ("hopper", "walker2d")
+    } == {1_000_000}
+
+
+def test_its_hours_are_those_of_the_measured_speeds():
+    ratios = {}
+    for line in re.findall(r"^\| [A-Za-z].* \|$", RESULTS.split("## Speed\n")[1], re.M):
+        name, *cells = [cell.strip() for cell in line.split("|")[1:-1]]
+        ratios[name] = [float(cell.split()[0]) for cell in cells]
+    textbook = re.findall(r"1\.00 \((\d+)/s\)", RESULTS)
+    assert len(ratios) == 12 and len(textbook) == 4
+    for machine, column in {"AMD EPYC": 0, "Intel Xeon": 2}.items():
+        cells = []
+        for name in ("wpc.py", "compiled wpc.py"):
+            speed = ratios[name][column] * int(textbook[column])
+            cells.append(f"{speed:.0f}/s, {1e6 / speed / 3600:.1f} hours")
+        assert f"\n| {machine}, one core | {cells[0]} | {cells[1]} |\n" in README
+    row = re.search(r"\| NVIDIA H200 \| (\d+) to (\d+)/s, (.*?) \|", README)
+    slow, fast, hours = row.groups()
+    least, most = (1e6 / int(speed) / 3600 for speed in (fast, slow))
+    assert hours == f"{least:.1f} to {most:.1f} hours"
+    assert f"it makes {slow} to {fast} steps a second." in RESULTS
+    speed = "made 2,927 steps a second each"
+    assert speed in README and speed in RESULTS
 
 
 def test_what_it_says_of_the_zoos_agents_is_in_its_table():
@@ -290,27 +544,43 @@ def test_what_it_says_of_the_zoos_agents_is_in_its_table():
 
 
 def prose(text):
-    """The README's words without code, tables, and what links lead to."""
+    """A page's text without code, tables, and what links lead to."""
     text = re.sub(r"^```.*?^```$|^\|.*?$|<!--.*?-->", "", text, flags=re.M | re.S)
-    return re.sub(r"\]\([^)]*\)", "]", text).split()
+    return re.sub(r"\]\([^)]*\)", "]", text)
 
 
 def test_it_is_short():
-    assert len(prose(README)) <= WORDS
+    text = re.sub(r"^```.*?^```$|^\|.*?$", "", README, flags=re.M | re.S)
+    assert len(text.split()) <= WORDS
+
+
+@pytest.mark.parametrize("page", [README, RESULTS])
+def test_no_sentence_has_more_than_two_numbers(page):
+    text = re.sub(r"`[^`]*`|\[[^]]*\]", "x", prose(page))
+    for sentence in re.split(r"(?<=[.:;!?)])\s+|\n\n|\n(?=- )", text):
+        numbers = re.findall(r"(?<![\w.*-])-?\d[\d,.]*(?![\w-])", sentence)
+        assert len(numbers) <= 2, sentence
 
 
 @pytest.mark.parametrize(
     "text", ["```\na b\n```\n", "| a | b |\n|---|---|\n", "](http://a b)"]
 )
 def test_tables_and_code_do_not_count(text):
-    assert prose(f"One two\n{text}") in (["One", "two"], ["One", "two", "]"])
+    words = prose(f"One two\n{text}").split()
+    assert words in (["One", "two"], ["One", "two", "]"])
 
 
-def test_files_that_it_links_to_exist():
-    links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", README)
+@pytest.mark.parametrize("page", ["README.md", "tests/results/README.md"])
+def test_what_it_links_to_exists(page):
+    text = (ROOT / page).read_text()
+    links = re.findall(r"\]\(([^):#]*)(?:#([^)]*))?\)", text)
     assert len(links) > 5
-    for link in links:
-        assert (ROOT / link).exists(), link
+    for link, anchor in links:
+        target = (ROOT / page).parent / link if link else ROOT / page
+        assert target.exists(), link
+        if anchor and target.suffix == ".md":
+            titles = re.findall(r"^#+ (.*)$", target.read_text(), re.M)
+            assert anchor in [x.lower().replace(" ", "-") for x in titles], anchor
 
 
 if __name__ == "__main__":
