@@ -193,6 +193,7 @@ class Agent:
         args, max_action = self.args, self.actor.max_action
         s, a, r = batch["observations"], batch["actions"], batch["rewards"]
         s_next, done = batch["next_observations"], batch["terminals"]
+        assert r.shape == done.shape == (*a.shape[:-1], 1), "must be (B, 1)"
 
         # Target: the smaller of the two target Q-values, at a noisy next action
         with torch.no_grad():
@@ -202,7 +203,6 @@ class Agent:
             a_next = a_next.clamp(-max_action, max_action)
             q1_next, q2_next = self.critic_target(s_next, a_next)
             y = r + args.discount * (1 - done) * torch.min(q1_next, q2_next)
-            assert y.shape == q1_next.shape, "rewards and terminals must be (B, 1)"
 
         # Critics: Q1 and Q2 fit the target
         q1, q2 = self.critic(s, a)
@@ -422,22 +422,23 @@ def read_dataset(path, state_dim, action_dim, max_action):
                 "such rows: numbers must be finite, terminals and timeouts 0 or 1, "
                 f"and actions from {-max_action:g} to {max_action:g}"
             )
-    following = np.roll(arrays["observations"], -1, axis=0)
-    return {"next_observations": following} | arrays
+    return arrays
 
 
 def prepare_dataset(arrays, args):
     """The transitions of the columns that `read_dataset` returns, ready for training.
 
-    Row i gives (o[i], a[i], r[i], next_observations[i], terminal[i]), where d4rl always
-    takes o[i + 1]. As in d4rl, rows with a timeout, whose o[i + 1] is in the next
-    episode, and the last row give none. A terminal row stays, whatever its timeout
-    says, as its next state doesn't count.
+    Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]); where there
+    are next_observations, which d4rl ignores, these replace o[i + 1]. As in d4rl, rows
+    with a timeout, whose o[i + 1] is in the next episode, and the last row give none.
+    A terminal row stays, whatever its timeout says, as its next state doesn't count.
 
     Returns them by name, float32 tensors (N, width) with normalized states; the mean
     and std, each (state_dim,), that normalize them; and the best discounted return from
     any row to its episode's end, to compare Q with.
     """
+    following = np.roll(arrays["observations"], -1, axis=0)
+    arrays = {"next_observations": following} | arrays
     terminals, timeouts = arrays["terminals"], arrays["timeouts"]
     keep = np.flatnonzero((terminals >= timeouts)[:-1])
     if not keep.size:

@@ -353,6 +353,7 @@ def test_its_change_for_another_logger_works(monkeypatch, tmp_path):
     wandb = types.SimpleNamespace(
         init=lambda config: configs.append(config),
         log=lambda row, step: logged.update({step: row}),
+        finish=lambda: None,
     )
     monkeypatch.setitem(sys.modules, "wandb", wandb)
     module = changed_script("import wandb", tmp_path, "wpc_with_another_logger")
