@@ -396,9 +396,9 @@ def read_dataset(path, state_dim, action_dim, max_action):
         bad = np.flatnonzero(~good.all(axis=1))
         if bad.size:
             raise UserError(
-                f"{path}: {key} has {column[bad[0]]} in row {bad[0]}, and {bad.size:,} "
-                "such rows: numbers must be finite, terminals and timeouts 0 or 1, "
-                f"and actions from {-max_action:g} to {max_action:g}"
+                f"{path}: {key} is wrong in {bad.size} of {len(column)} rows, first "
+                f"in row {bad[0]}, {column[bad[0]]}: numbers must be finite, terminals "
+                f"and timeouts 0 or 1, actions from {-max_action:g} to {max_action:g}"
             )
     return arrays
 
