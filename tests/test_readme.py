@@ -82,6 +82,7 @@ def rows_of(text, title):
 
 def test_its_results_are_the_reports():
     ours, theirs = rows_of(README, "Results"), rows_of(TABLES, "Table 1")
+    theirs = [row for row in theirs if row[2] != "-"]  # tasks with runs of ours
     assert len(ours) == len(theirs)
     for row, cells in zip(ours, theirs, strict=True):
         cells = ["" if x == "-" else re.sub(r"; [\d,]+k\)", ")", x) for x in cells]

@@ -61,6 +61,12 @@ SYSTEMS = {
     "wPC-rnd": ("#56B4E9", ":"),
     "static weight": ("#D55E00", (0, (8, 2))),
 }
+OUR_DATA = {
+    "random": "of uniform actions",
+    "medium": "of D4RL's policy",
+    "medium-replay": "of our SAC agent (D4RL: 202,000, 402,000 and 302,000)",
+    "medium-expert": "of D4RL's medium policy and an expert that is not D4RL's",
+}
 COMPARED = ["wPC", "TD3+BC", "wBC"]
 OF_WEIGHTS = {"exponential": "wPC-e", "random": "wPC-rnd", "static": "static weight"}
 NOT_COMPARED = "env dataset seed max_timesteps eval_freq eval_episodes device run_dir"
@@ -166,7 +172,8 @@ def read_run(folder):
         script, system = "td3_bc", "TD3+BC" if args["alpha"] else "BC"
     else:
         script, system = "wbc", "wBC"
-    defaults = vars(importlib.import_module(script).Args(env=task, dataset="-"))
+    env = "hopper-medium-expert-v2" if "medium-expert" in task else "hopper-medium-v2"
+    defaults = vars(importlib.import_module(script).Args(env=env, dataset="-"))
     if system == "BC":
         defaults["alpha"] = 0
     if system in OF_WEIGHTS.values():
@@ -248,10 +255,11 @@ def score_table(groups, tasks, systems):
     """Our scores, and beside them those that were published."""
     path = ROOT / "tests/results/datasets.csv"
     data = list(csv.DictReader(path.open())) if path.exists() else []
-    data = {(row["task"], row["best_return"]): row["mean_score"] for row in data}
+    data = {(row["task"], row["best_return"]): row for row in data}
     best = {x.task: x.data for x in groups.values() if not x.others}
+    data = {task: data.get((task, best.get(task))) for task in tasks}
     header = ["task", "the data"]
-    rows = [[task, data.get((task, best.get(task)), "-")] for task in tasks]
+    rows = [[task, data[task]["mean_score"] if data[task] else "-"] for task in tasks]
     for system in systems:
         sources = [source for source in PUBLISHED if source.startswith(f"{system},")]
         header += [system, *sources]
@@ -259,7 +267,14 @@ def score_table(groups, tasks, systems):
             group = groups.get((row[0], system, ""))
             ours = f"{mean_and_std(group.last_ten())} ({group.size})" if group else "-"
             row += [ours, *(published(source, row[0]) for source in sources)]
-    return markdown(header, rows)
+    for row, known in zip(rows, data.values(), strict=True):
+        kind = row[0].partition("-")[2]
+        row.append(
+            f"{int(known['transitions']):,}, {OUR_DATA.get(kind, 'own')}"
+            if known
+            else "-"
+        )
+    return markdown([*header, "whose data"], rows)
 
 
 def difference(group, other):
@@ -287,30 +302,20 @@ def difference_table(groups, tasks, systems):
     return markdown(["task", *(f"{first} - {other}" for other in others)], rows)
 
 
-def interquartile_mean(*tasks, axis=-1):
-    return stats.trim_mean(np.concatenate(tasks, axis=axis), 0.25, axis=axis)
-
-
-def interquartile_table(groups, systems):
-    """A row for each set of tasks on which all systems have as many seeds and steps,
-    with a 95% interval by the stratified bootstrap (Agarwal et al., NeurIPS 2021)."""
-    alike, rows = {}, []
-    for task in TASKS:
-        of_task = [groups[task, s, ""] for s in systems if (task, s, "") in groups]
-        kinds = {(group.size, group.data) for group in of_task}
-        if len(of_task) == len(systems) and len(kinds) == 1 and len(of_task[0].q) > 1:
-            alike.setdefault(of_task[0].size, []).append(of_task)
-    for size, of_tasks in alike.items():
-        row = [f"{', '.join(of_task[0].task for of_task in of_tasks)} ({size})"]
-        for of_system in zip(*of_tasks, strict=True):
-            x = [group.last_ten() for group in of_system]
-            options = {"method": "percentile", "n_resamples": 20_000, "rng": 0}
-            test = stats.bootstrap(x, interquartile_mean, **options)
-            low, high = test.confidence_interval
-            row.append(f"{interquartile_mean(*x):.1f} [{low:.1f}, {high:.1f}]")
-        if len(of_tasks) > 1:
+def totals_table(groups, systems):
+    """Sums over the tasks of Table 1 that a system has runs on, ours and published."""
+    rows = []
+    for system in systems:
+        tasks = [task for task in TASKS if (task, system, "") in groups]
+        ours = sum(groups[task, system, ""].last_ten().mean() for task in tasks)
+        row = [system, str(len(tasks)), f"{ours:.1f}"]
+        for source, summed in (("paper", tasks), ("CORL", tasks), ("paper", TASKS)):
+            scores = [published(f"{system}, {source}", task) for task in summed]
+            row.append("-" if "-" in scores else f"{sum(map(float, scores)):.1f}")
+        if tasks:
             rows.append(row)
-    return markdown(["tasks", *systems], rows)
+    header = ["system", "tasks", "these runs", "paper", "CORL", "paper, all twelve"]
+    return markdown(header, rows)
 
 
 def span(values, form):
@@ -427,6 +432,9 @@ def draw(path, panels):
         axis.autoscale_view()
         axis.set(title=title, xlabel="training steps (thousands)", ylabel=ylabel)
         axis.grid(alpha=0.3)
+        if not curves:
+            axis.text(0.5, 0.5, "no run yet", ha="center", transform=axis.transAxes)
+            axis.set(xticks=[], yticks=[], xlabel=None, ylabel=None)
     for axis in axes.flat[len(panels) :]:
         axis.remove()
     figure.legend(
@@ -448,15 +456,17 @@ INTRODUCTION = """\
 Scores are D4RL's normalized ones, or returns where a task is called "(mean return)". A
 score is the mean of a run's last ten evaluations; over seeds: mean ± sample standard
 deviation (seeds; training steps). What the paper and CORL have published is of D4RL's
-own files. "The data" is the mean score of the episodes trained on, where the report
-knows it (tests/results/datasets.csv). Runs whose arguments, other than --weight, differ
-from the scripts' defaults are in the table on Q alone.
+own files. "The data" is the mean score of the episodes trained on and "whose data" the
+number of transitions and whom they are of, where the report knows them
+(tests/results/datasets.csv). Runs whose arguments, other than --weight, differ from the
+scripts' defaults are in the table on Q alone.
 """
 NOTES = {
     "Differences": "Mean, 95% interval and p of Welch's t test, not corrected for "
     "the number of tests (seeds of each; steps).",
-    "Interquartile means": "Over all runs of the tasks on which the systems have as "
-    "many seeds and steps; 95% interval by a bootstrap over the seeds of each task.",
+    "Totals": "Over the tasks of Table 1 on which a system has runs here, which are "
+    "not the same for all systems; beside them what is published for the same tasks. "
+    "(Of all twelve, the paper prints 711.4 for wBC, but its scores add up to 712.7.)",
     "When does Q run away?": "Q (its mean over a batch) divided by the best discounted "
     "return-to-go of the data, from the lowest to the highest seed: the mean "
     "of the last ten evaluations, the largest and its step; how many seeds had it over "
@@ -492,12 +502,15 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
         if np.isin(group.steps, curve["step"]).any():
             pairs.append((group, curve))
 
+    all_tasks = tasks_of(*COMPARED, "BC")
+    if set(all_tasks) & set(TASKS):
+        all_tasks = list(dict.fromkeys([*TASKS, *all_tasks]))
     table_1, weights = [*COMPARED, "BC"], ["wPC", "TD3+BC", *OF_WEIGHTS.values()]
     others = tasks_of(*OF_WEIGHTS.values())
     tables = {
-        "Table 1": score_table(groups, tasks_of(*table_1), table_1),
+        "Table 1": score_table(groups, all_tasks, table_1),
+        "Totals": totals_table(groups, table_1),
         "Differences": difference_table(groups, tasks_of(*COMPARED), COMPARED),
-        "Interquartile means": interquartile_table(groups, COMPARED),
         "Other weights (Table 2, Figure 4)": score_table(groups, others, weights),
         "Differences to other weights": difference_table(
             groups, others, ["wPC", *OF_WEIGHTS.values()]
@@ -517,7 +530,7 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
     figure4 = itertools.product(static, ("q", "scores"))
     figure5 = tasks_of("wPC-e", "wPC-rnd")
     figures = {
-        "figure2": [panel(groups, task, COMPARED, "scores") for task in compared],
+        "figure2": [panel(groups, task, COMPARED, "scores") for task in all_tasks],
         "figure3": [panel(groups, task, COMPARED, "q") for task in compared],
         "figure4": [panel(groups, t, ["wPC", "static weight"], x) for t, x in figure4],
         "figure5": [panel(groups, task, weights[:4], "scores") for task in figure5],
@@ -525,7 +538,7 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
         "reproduction": [reproduction_panel(*pair) for pair in pairs],
     }
     for name, panels in figures.items():
-        if panels:
+        if any(curves for _, _, curves, _ in panels):
             draw(out / f"{name}.png", panels)
 
 
