@@ -3,7 +3,7 @@
 check_steps.py.
 
 tests/data/minari holds datasets that Minari's own DataCollector made (see
-tests/tools/make_minari_data.py): some episodes of Hopper-v5 end and some are cut off,
+tests/data/minari/make.py): some episodes of Hopper-v5 end and some are cut off,
 all of Pendulum-v1's are cut off.
 """
 

@@ -392,15 +392,15 @@ def runaway_panels(groups):
     shown = sorted(shown, key=lambda group: -group.alpha)
     alphas = dict.fromkeys(group.alpha for group in shown)
     styles = dict(zip(alphas, itertools.cycle(SYSTEMS.values()), strict=False))
-    q_panels, score_panels = {}, {}
-    for group in shown:
-        curve = f"alpha {group.alpha}", styles[group.alpha], group.steps
-        task, ratio = group.task, group.q / group.best_return
-        empty = task, "Q / best return in the data", [], [(1, "black", "--")]
-        q_panels.setdefault(task, empty)[2].append((*curve, band(ratio)))
-        empty = task, "score", [], []
-        score_panels.setdefault(task, empty)[2].append((*curve, band(group.scores)))
-    return [*q_panels.values(), *score_panels.values()]
+    panels = {}
+    for ylabel in ("Q / best return in the data", "score"):
+        levels = [(1, "black", "--")] if ylabel != "score" else []
+        for group in shown:
+            x = group.scores if ylabel == "score" else group.q / group.best_return
+            curve = f"alpha {group.alpha}", styles[group.alpha], group.steps, band(x)
+            empty = group.task, ylabel, [], levels
+            panels.setdefault((ylabel, group.task), empty)[2].append(curve)
+    return [*panels.values()]
 
 
 def reproduction_panel(group, curve):
@@ -496,11 +496,9 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
     path = ROOT / "tests/results/td3_bc_on_d4rl.csv"
     options = {"delimiter": ",", "dtype": None, "encoding": "utf-8"}
     on_d4rl = np.genfromtxt(path, names=True, skip_header=4, **options)
-    pairs = []
-    for task in tasks_of("TD3+BC"):
-        group, curve = groups[task, "TD3+BC", ""], on_d4rl[on_d4rl["task"] == task]
-        if np.isin(group.steps, curve["step"]).any():
-            pairs.append((group, curve))
+    td3_bc = (groups[task, "TD3+BC", ""] for task in tasks_of("TD3+BC"))
+    pairs = [(group, on_d4rl[on_d4rl["task"] == group.task]) for group in td3_bc]
+    pairs = [pair for pair in pairs if np.isin(pair[0].steps, pair[1]["step"]).any()]
 
     all_tasks = tasks_of(*COMPARED, "BC")
     if set(all_tasks) & set(TASKS):
@@ -526,20 +524,22 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
     (out / "tables.md").write_text(text)
     print(f"{text}\nwrote {out / 'tables.md'}")
 
-    compared, static = tasks_of(*COMPARED, at_least=2), tasks_of("static weight")
-    figure4 = itertools.product(static, ("q", "scores"))
-    figure5 = tasks_of("wPC-e", "wPC-rnd")
+    def panels(tasks, systems, *columns):
+        pairs = itertools.product(tasks, columns)
+        return [panel(groups, task, systems, column) for task, column in pairs]
+
+    static = tasks_of("static weight")
     figures = {
-        "figure2": [panel(groups, task, COMPARED, "scores") for task in all_tasks],
-        "figure3": [panel(groups, task, COMPARED, "q") for task in compared],
-        "figure4": [panel(groups, t, ["wPC", "static weight"], x) for t, x in figure4],
-        "figure5": [panel(groups, task, weights[:4], "scores") for task in figure5],
+        "figure2": panels(all_tasks, COMPARED, "scores"),
+        "figure3": panels(tasks_of(*COMPARED, at_least=2), COMPARED, "q"),
+        "figure4": panels(static, ["wPC", "static weight"], "q", "scores"),
+        "figure5": panels(tasks_of("wPC-e", "wPC-rnd"), weights[:4], "scores"),
         "runaway": runaway_panels(groups),
         "reproduction": [reproduction_panel(*pair) for pair in pairs],
     }
-    for name, panels in figures.items():
-        if any(curves for _, _, curves, _ in panels):
-            draw(out / f"{name}.png", panels)
+    for name, drawn in figures.items():
+        if any(curves for _, _, curves, _ in drawn):
+            draw(out / f"{name}.png", drawn)
 
 
 def main(arguments=None):
