@@ -76,7 +76,7 @@ EXPERIMENTS = {  # the scripts with what tells their runs apart, and the tasks
     "figure4": ("wpc wpc--weight=static", ["walker2d-medium"]),
     "runaway": (
         "wpc wpc--alpha=1.0 wpc--alpha=0.5 wpc--alpha=0.1",
-        ["walker2d-medium", "walker2d-medium-200000", "walker2d-medium-50000"],
+        ["walker2d-medium"],
     ),
 }
 
@@ -93,19 +93,15 @@ def list_commands(
     Args:
         experiment: a table or figure of the paper, or "When does Q run away?"
         runs: folder of the run folders
-        datasets: folder with files such as halfcheetah_medium.hdf5, used for D4RL's;
-            for runaway also walker2d_medium_200000.hdf5, walker2d_medium_50000.hdf5
+        datasets: folder with files such as halfcheetah_medium.hdf5, used for D4RL's
         seeds: number of seeds
         compiled: run the scripts by tests/tools/compiled.py
     """
     systems, tasks = EXPERIMENTS[experiment]
     for task, system, seed in itertools.product(tasks, systems.split(), range(seeds)):
-        env = re.sub(r"-\d+$", "", task)  # a part of its dataset is no task of D4RL's
-        if env != task and not datasets:
-            continue
         script, *option = system.split("--")
         line = ["python", *["tests/tools/compiled.py"] * compiled, f"{script}.py"]
-        line += ["--env", f"{env}-v2", "--seed", str(seed)]
+        line += ["--env", f"{task}-v2", "--seed", str(seed)]
         if datasets:
             line += ["--dataset", f"{datasets}/{task.replace('-', '_')}.hdf5"]
         line += ["--max-timesteps", "1000000", "--eval-freq", "10000"]
@@ -381,26 +377,28 @@ def panel(groups, task, systems, column):
 
 
 def runaway_panels(groups):
-    """Q and scores of wPC with several alphas, or on parts of a dataset."""
-    families = {}
+    """Q and scores of wPC on the tasks that have runs of several alphas."""
+    tasks = {}
     for group in groups.values():
         of_alpha = group.system == "wPC" and re.fullmatch(r"(alpha \S+)?", group.others)
         if of_alpha and group.best_return > 0:
-            family = re.sub(r"-\d+k?$", "", group.task)
-            families.setdefault(family, []).append(group)
-    shown = itertools.chain(*(x for x in families.values() if len(x) > 1))
-    shown = sorted(shown, key=lambda group: -group.alpha)
-    alphas = dict.fromkeys(group.alpha for group in shown)
+            tasks.setdefault(group.task, []).append(group)
+    tasks = {task: shown for task, shown in tasks.items() if len(shown) > 1}
+    alphas = sorted({x.alpha for shown in tasks.values() for x in shown}, reverse=True)
     styles = dict(zip(alphas, itertools.cycle(SYSTEMS.values()), strict=False))
-    panels = {}
-    for ylabel in ("Q / best return in the data", "score"):
-        levels = [(1, "black", "--")] if ylabel != "score" else []
-        for group in shown:
-            x = group.scores if ylabel == "score" else group.q / group.best_return
-            curve = f"alpha {group.alpha}", styles[group.alpha], group.steps, band(x)
-            empty = group.task, ylabel, [], levels
-            panels.setdefault((ylabel, group.task), empty)[2].append(curve)
-    return [*panels.values()]
+    panels = []
+    for ylabel, levels in (
+        ("Q / best return in the data", [(1, "black", "--")]),
+        ("score", []),
+    ):
+        for task, shown in tasks.items():
+            curves = []
+            for group in sorted(shown, key=lambda group: -group.alpha):
+                x = group.scores if ylabel == "score" else group.q / group.best_return
+                style = styles[group.alpha]
+                curves.append((f"alpha {group.alpha}", style, group.steps, band(x)))
+            panels.append((task, ylabel, curves, levels))
+    return panels
 
 
 def reproduction_panel(group, curve):
