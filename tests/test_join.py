@@ -107,7 +107,7 @@ def without(name, **changes):
 
 SECOND = {
     "no timeouts": (without("timeouts"), "has no timeouts, which D4RL's format needs"),
-    "next": (columns(1, with_next=True), "hdf5 has not: add them there"),
+    "next": (columns(1, with_next=True), "a.hdf5 has none: make a copy"),
     "width": (without("", observations=np.zeros((20, 17))), "11 numbers wide in"),
     "the same": (columns(0), "hold the same data: name them once"),
     "short": (without("", rewards=np.zeros(19)), "rewards has shape (19,)"),

@@ -82,8 +82,8 @@ def check(paths, parts):
             if "next_observations" in columns:
                 with_key, without = other, path
             sys.exit(
-                f"{with_key} has next_observations and {without} has not: add them "
-                "there, or delete them here"
+                f"{with_key} has next_observations and {without} has none: make a copy "
+                "of the former without them, or add them to the latter"
             )
         for name in part:
             if part[name].shape[1:] != columns[name].shape[1:]:
