@@ -65,6 +65,15 @@ def report(tool, runs, out):
     return printed, tables
 
 
+def with_runs(table):
+    """The rows of Table 1 on tasks that a system has runs on."""
+    return [
+        row
+        for row in table
+        if {row[x] for x in ("wPC", "TD3+BC", "wBC", "BC")} != {"-"}
+    ]
+
+
 def catch_figures(monkeypatch):
     """The panels of each figure by its name, in place of the pictures."""
     drawn = {}
@@ -89,7 +98,7 @@ def listed(tool, *arguments):
 
 @pytest.mark.parametrize(
     ("experiment", "runs"),
-    [("table1", 12 * 3), ("table2", 12 * 4), ("figure4", 2), ("runaway", 4 * 3)],
+    [("table1", 12 * 3), ("table2", 12 * 4), ("figure4", 2), ("runaway", 4)],
 )
 def test_the_scripts_take_the_commands(tool, experiment, runs):
     lines = listed(
@@ -102,8 +111,8 @@ def test_the_scripts_take_the_commands(tool, experiment, runs):
         assert python == "python"
         assert (args.max_timesteps, args.eval_freq) == (1_000_000, 10_000)
         folder, name = args.run_dir.split("/")
-        task = name.split("__")[0]  # or a part of its dataset
-        assert folder == "my runs" and task.startswith(args.env.removesuffix("-v2"))
+        task = name.split("__")[0]
+        assert folder == "my runs" and args.env == f"{task}-v2"
         assert args.dataset == f"data/{task.replace('-', '_')}.hdf5"
         folders.add(args.run_dir)
     assert len(folders) == 2 * runs
@@ -126,7 +135,7 @@ def test_the_list_says_what_the_paper_compared(tool):
     lines = [
         " ".join(line) for line in listed(tool, "runaway", "--seeds", 1, "--compiled")
     ]
-    assert len(lines) == 4  # parts of D4RL's file are not to be had
+    assert len(lines) == 4
     assert all(x.startswith("python tests/tools/compiled.py wpc.py") for x in lines)
     assert [line.count("--alpha=") for line in lines] == [0, 1, 1, 1]
 
@@ -158,7 +167,10 @@ def test_a_report_by_hand(tool, tmp_path):
     out, tables = report(tool, tmp_path, tmp_path / "report")
     assert "passed over" not in out
 
-    hopper, walker = tables["Table 1"]
+    tasks = [row["task"] for row in tables["Table 1"]]
+    assert tasks == experiments.TASKS
+    assert tables["Table 1"][0]["wPC, paper"] == "19.6"  # also where there are no runs
+    hopper, walker = with_runs(tables["Table 1"])
     assert hopper["the data"] == "-"  # as it is not ours, whose best return is another
     assert hopper["task"] == "hopper-medium" and walker["task"] == "walker2d-medium"
     assert hopper["wPC"] == "2.0 ± 1.0 (3; 0.12k)"
@@ -177,10 +189,13 @@ def test_a_report_by_hand(tool, tmp_path):
     hopper, _ = tables["Differences"]
     assert hopper["wPC - TD3+BC"] == hopper["wPC - wBC"] == expected
 
-    (row,) = tables["Interquartile means"]
-    assert row["tasks"] == "hopper-medium, walker2d-medium (3; 0.12k)"
-    # Of 1, 2, 3, 11, 12, 13, the lowest and the highest are left out.
-    assert row["wPC"].startswith("7.0 [") and row["TD3+BC"].startswith("14.0 [")
+    totals = [list(row.values()) for row in tables["Totals"]]
+    assert totals == [  # the paper's on the same two tasks, CORL's, the paper's in all
+        ["wPC", "2", "14.0", "172.5", "-", "800.7"],
+        ["TD3+BC", "2", "28.0", "140.9", "143.1", "712.9"],
+        ["wBC", "2", "28.0", "145.2", "-", "712.7"],
+        ["BC", "1", "4.0", "52.9", "53.5", "475.5"],
+    ]
 
     (row,) = tables["Other weights (Table 2, Figure 4)"]
     assert row["static weight"] == "6.0 (1; 0.12k)" and row["wPC-e, paper"] == "67.0"
@@ -211,7 +226,7 @@ def test_runs_of_unequal_length(tool, tmp_path):
         make_run(path, "td3_bc", "hopper_medium", seed, seed, steps=steps)
     out, tables = report(tool, tmp_path, tmp_path / "report")
     assert "('hopper-medium', 'TD3+BC', '') counts to step 100, not to 200" in out
-    (row,) = tables["Table 1"]
+    (row,) = with_runs(tables["Table 1"])
     # Steps 155, 160, ..., 200; seed 1 scores one more
     assert row["wPC"] == "178.0 ± 0.7 (2; 0.2k)"
     assert row["TD3+BC"] == "0.5 ± 0.7 (2; 0.1k)"
@@ -228,7 +243,7 @@ def test_runs_evaluated_at_other_steps(tmp_path, tool):
         make_run(tmp_path / str(i), script, "hopper_medium", seed, 50, steps=steps)
     out, tables = report(tool, tmp_path, tmp_path / "report")
     assert "passed over: ('hopper-medium', 'wBC', '') (its runs share 0" in out
-    (row,) = tables["Table 1"]
+    (row,) = with_runs(tables["Table 1"])
     assert row["TD3+BC"] == "50.0 ± 0.0 (2; 0.121k)" and row["wBC"] == "-"
     assert "Differences" not in tables
 
@@ -258,7 +273,7 @@ def test_runs_that_are_of_no_use_are_passed_over(tool, tmp_path):
             (path / "args.json").write_text(text)
     (make_run(runs / "new", "wpc", "x", 4, 1) / "evaluations.csv").unlink()
     out, tables = report(tool, runs, tmp_path / "report")
-    (row,) = tables["Table 1"]
+    (row,) = with_runs(tables["Table 1"])
     assert row["wPC"] == "50.0 (1; 0.12k)"
     lines = [line for line in out.splitlines() if line.startswith("passed over: ")]
     for name in (*bad, "no args", "args", "other", twin.name, short.name):
@@ -273,7 +288,7 @@ def test_runs_on_different_data_are_no_seeds_of_one_system(tool, tmp_path):
         path /= "evaluations.csv"
         path.write_text(path.read_text().replace("10.0,5.0\n", f"1{seed}.0,5.0\n"))
     printed, tables = report(tool, tmp_path, tmp_path / "report")
-    (row,) = tables["Table 1"]
+    (row,) = with_runs(tables["Table 1"])
     assert row["wPC"] == "10.0 ± 0.0 (2; 0.12k)" and row["wBC"] == "-"
     assert "'wBC', '') (different data, with best returns 10.0 and 11.0)" in printed
 
@@ -290,8 +305,6 @@ def test_systems_on_different_data_are_not_compared(tmp_path):
     systems = {system: groups["hopper-medium", system, ""] for _, system, _ in groups}
     assert experiments.difference(systems["wPC"], systems["TD3+BC"]).startswith("0.0 [")
     assert experiments.difference(systems["wPC"], systems["wBC"]) == "-"
-    assert experiments.interquartile_table(groups, ["wPC", "TD3+BC"])
-    assert not experiments.interquartile_table(groups, ["wPC", "wBC"])
 
 
 def test_q_is_drawn_where_returns_are_negative(tmp_path, monkeypatch):
@@ -328,13 +341,15 @@ def test_what_is_kept_apart(tool, tmp_path):
     path = make_run(tmp_path / "5", "wbc", task, 1, 60) / "evaluations.csv"
     path.write_text(path.read_text().replace("normalized_score", "other"))
     _, tables = report(tool, tmp_path, tmp_path / "report")
-    scores = {row["task"]: (row["wPC"], row["wBC"]) for row in tables["Table 1"]}
+    scores = {
+        row["task"]: (row["wPC"], row["wBC"]) for row in with_runs(tables["Table 1"])
+    }
     assert scores == {
         "hopper-medium": ("10.0 (1; 0.12k)", "-"),
         "hopper-medium-expert": ("30.0 (1; 0.12k)", "-"),
         "hopper-medium (mean return)": ("-", "3.0 (1; 0.12k)"),
     }
-    assert figures(tmp_path / "report") == {"runaway"}
+    assert figures(tmp_path / "report") == {"figure2", "runaway"}
     rows = tables["When does Q run away?"]
     assert {(row["arguments"], row["score"]) for row in rows} == {
         ("alpha 2.5", "10.0"),
@@ -344,45 +359,6 @@ def test_what_is_kept_apart(tool, tmp_path):
         ("weight mine", "50.0"),
         ("", "3.0"),
     }
-
-
-def test_the_interquartile_mean_and_its_interval():
-    """By hand, and by going through all that the bootstrap could draw."""
-    tasks = np.array([[0.0, 4, 1], [43, 40, 41], [80, 87, 82]])
-    # Of nine scores, the two lowest and the two highest are left out.
-    assert experiments.interquartile_mean(*tasks) == (4 + 40 + 41 + 43 + 80) / 5
-    groups = {}
-    for task, scores in zip(experiments.TASKS, tasks, strict=False):
-        scores = np.repeat(scores[:, None], 10, axis=1)
-        key = task, "wPC", ""
-        groups[key] = experiments.Group(*key, 2.5, 1.0, np.arange(10), scores, scores)
-    text = experiments.interquartile_table(groups, ["wPC"]).splitlines()[2]
-    draws = [list(itertools.product(task, repeat=3)) for task in tasks]
-    middles = [
-        sorted(itertools.chain(*drawn))[2:-2] for drawn in itertools.product(*draws)
-    ]
-    low, high = np.percentile(np.mean(middles, axis=1), [2.5, 97.5])
-    mean, bounds = text.split(" | ")[1].removesuffix("] |").split(" [")
-    assert mean == "41.6"
-    assert [float(x) for x in bounds.split(", ")] == pytest.approx(
-        [low, high], abs=0.25
-    )
-
-
-def test_tasks_of_other_seeds_or_steps_have_means_of_their_own():
-    groups = {}
-    sizes = [(3, 10), (2, 10), (3, 10), (3, 11), (2, 10), (1, 10), (1, 10)]
-    sizes += [(4, 10), (4, 10)]  # of wPC, and of wBC one seed fewer
-    for task, (seeds, length) in zip(experiments.TASKS, sizes, strict=False):
-        for system in ("wPC", "wBC"):
-            fewer = seeds == 4 and system == "wBC"
-            steps, x = np.arange(length) * 1000, np.ones((seeds - fewer, length))
-            key = task, system, ""
-            groups[key] = experiments.Group(*key, 2.5, 1.0, steps, x, x)
-    table = experiments.interquartile_table(groups, ["wPC", "wBC"])
-    tasks = [line.split(" | ")[0] for line in table.splitlines()[2:]]
-    first, second, third, _, fifth, *_ = experiments.TASKS
-    assert tasks == [f"| {first}, {third} (3; 9k)", f"| {second}, {fifth} (2; 9k)"]
 
 
 def test_the_data_have_a_score_of_their_own(tmp_path, monkeypatch):
@@ -398,11 +374,22 @@ def test_the_data_have_a_score_of_their_own(tmp_path, monkeypatch):
     path = tmp_path / "tests/results/datasets.csv"
     path.parent.mkdir(parents=True)
     path.write_text(
-        "task,mean_score,best_return\nhopper-medium,44.2,10.0\nwalker2d-medium,9,11.0\n"
+        "task,transitions,mean_score,best_return\nhopper-medium,1000,44.2,10.0\n"
+        "walker2d-medium,2000,9,11.0\n"
     )
     table = experiments.score_table(groups, ["hopper-medium", "walker2d-medium"], [])
-    rows = ["| hopper-medium | 44.2 |", "| walker2d-medium | - |"]
+    rows = ["| hopper-medium | 44.2 | 1,000, of D4RL's policy |"]
+    rows.append("| walker2d-medium | - | - |")
     assert table.splitlines()[2:] == rows
+
+
+def test_a_report_on_tasks_of_ones_own(tool, tmp_path):
+    """It has no rows and no panels for the paper's twelve."""
+    make_run(tmp_path / "0", "td3_bc", "mine", 0, 10, alpha=0.0)
+    _, tables = report(tool, tmp_path, tmp_path / "report")
+    (row,) = tables["Table 1"]
+    assert row["task"] == "mine" and row["BC"] == "10.0 (1; 0.12k)"
+    assert "Totals" not in tables and figures(tmp_path / "report") == set()
 
 
 def test_a_report_without_runs(tmp_path):
@@ -441,8 +428,11 @@ def test_other_weights_and_what_is_drawn(tool, tmp_path, monkeypatch):
         return {name: [x.mean() for x in band] for name, _, _, band in shown}
 
     expected = {name: [10 * i, 10 * i + 1, 10 * i + 2] for i, name in enumerate(names)}
-    (panel,) = drawn["figure2"]
-    assert curves(panel) == {name: expected[name] for name in names[:2]}
+    assert [panel[0] for panel in drawn["figure2"]] == experiments.TASKS
+    (panel,) = (panel for panel in drawn["figure2"] if panel[2])
+    assert panel[0] == "hopper-medium" and curves(panel) == {
+        name: expected[name] for name in names[:2]
+    }
     (panel,) = drawn["figure3"]
     assert curves(panel)["TD3+BC"] == [10.5, 11.5, 12.5] and panel[3][0][0] == 10
     q, scores = drawn["figure4"]

@@ -91,7 +91,8 @@ def rows_of(text, title):
 
 
 def test_its_results_are_the_reports():
-    ours, theirs = rows_of(RESULTS, "Scores"), rows_of(TABLES, "Table 1")[:6]
+    ours, theirs = rows_of(RESULTS, "Scores"), rows_of(TABLES, "Table 1")
+    theirs = [row for row in theirs if row[2] != "-"]  # tasks with runs of ours
     ours = ours[: len(theirs)]
     assert len(ours) == 6
     for row, cells in zip(ours, theirs, strict=True):

@@ -15,6 +15,7 @@ import importlib.util
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated
 
 import torch
@@ -64,16 +65,6 @@ def random_batch(device):
     return [x.to(device) for x in (s, a, s_next, r, not_done)]
 
 
-class Buffer:
-    """A replay buffer with this batch alone."""
-
-    def __init__(self, batch):
-        self.batch = batch
-
-    def sample(self, batch_size):
-        return self.batch
-
-
 def largest_difference(peer, script, steps, v_before=False):
     """Of all parameters after so many steps of a script and of a file's TD3_BC."""
     torch.manual_seed(0)
@@ -87,11 +78,13 @@ def largest_difference(peer, script, steps, v_before=False):
         copy_parameters(ours.value, theirs.vnet)
     if v_before:
         ours.value = ValueBeforeUpdate(ours.value)
+    buffer = SimpleNamespace()
     for step in range(1, steps + 1):
         torch.manual_seed(step)
         s, a, s_next, r, not_done = batch = random_batch(device)
+        buffer.sample = lambda _, batch=batch: batch
         torch.manual_seed(step)
-        theirs.train(Buffer(batch))
+        theirs.train(buffer)
         torch.manual_seed(step)
         batch = {"observations": s, "actions": a, "next_observations": s_next}
         ours.update(batch | {"rewards": r, "terminals": 1 - not_done}, step)

@@ -61,6 +61,12 @@ SYSTEMS = {
     "wPC-rnd": ("#56B4E9", ":"),
     "static weight": ("#D55E00", (0, (8, 2))),
 }
+OUR_DATA = {
+    "random": "of uniform actions",
+    "medium": "of D4RL's policy",
+    "medium-replay": "of our SAC agent (D4RL: 202,000, 402,000 and 302,000)",
+    "medium-expert": "of D4RL's medium policy and an expert that is not D4RL's",
+}
 COMPARED = ["wPC", "TD3+BC", "wBC"]
 OF_WEIGHTS = {"exponential": "wPC-e", "random": "wPC-rnd", "static": "static weight"}
 NOT_COMPARED = "env dataset seed max_timesteps eval_freq eval_episodes device run_dir"
@@ -70,7 +76,7 @@ EXPERIMENTS = {  # the scripts with what tells their runs apart, and the tasks
     "figure4": ("wpc wpc--weight=static", ["walker2d-medium"]),
     "runaway": (
         "wpc wpc--alpha=1.0 wpc--alpha=0.5 wpc--alpha=0.1",
-        ["walker2d-medium", "walker2d-medium-200000", "walker2d-medium-50000"],
+        ["walker2d-medium"],
     ),
 }
 
@@ -87,19 +93,15 @@ def list_commands(
     Args:
         experiment: a table or figure of the paper, or "When does Q run away?"
         runs: folder of the run folders
-        datasets: folder with files such as halfcheetah_medium.hdf5, used for D4RL's;
-            for runaway also walker2d_medium_200000.hdf5, walker2d_medium_50000.hdf5
+        datasets: folder with files such as halfcheetah_medium.hdf5, used for D4RL's
         seeds: number of seeds
         compiled: run the scripts by tests/tools/compiled.py
     """
     systems, tasks = EXPERIMENTS[experiment]
     for task, system, seed in itertools.product(tasks, systems.split(), range(seeds)):
-        env = re.sub(r"-\d+$", "", task)  # a part of its dataset is no task of D4RL's
-        if env != task and not datasets:
-            continue
         script, *option = system.split("--")
         line = ["python", *["tests/tools/compiled.py"] * compiled, f"{script}.py"]
-        line += ["--env", f"{env}-v2", "--seed", str(seed)]
+        line += ["--env", f"{task}-v2", "--seed", str(seed)]
         if datasets:
             line += ["--dataset", f"{datasets}/{task.replace('-', '_')}.hdf5"]
         line += ["--max-timesteps", "1000000", "--eval-freq", "10000"]
@@ -166,7 +168,8 @@ def read_run(folder):
         script, system = "td3_bc", "TD3+BC" if args["alpha"] else "BC"
     else:
         script, system = "wbc", "wBC"
-    defaults = vars(importlib.import_module(script).Args(env=task, dataset="-"))
+    env = "hopper-medium-expert-v2" if "medium-expert" in task else "hopper-medium-v2"
+    defaults = vars(importlib.import_module(script).Args(env=env, dataset="-"))
     if system == "BC":
         defaults["alpha"] = 0
     if system in OF_WEIGHTS.values():
@@ -248,10 +251,11 @@ def score_table(groups, tasks, systems):
     """Our scores, and beside them those that were published."""
     path = ROOT / "tests/results/datasets.csv"
     data = list(csv.DictReader(path.open())) if path.exists() else []
-    data = {(row["task"], row["best_return"]): row["mean_score"] for row in data}
+    data = {(row["task"], row["best_return"]): row for row in data}
     best = {x.task: x.data for x in groups.values() if not x.others}
+    data = {task: data.get((task, best.get(task))) for task in tasks}
     header = ["task", "the data"]
-    rows = [[task, data.get((task, best.get(task)), "-")] for task in tasks]
+    rows = [[task, data[task]["mean_score"] if data[task] else "-"] for task in tasks]
     for system in systems:
         sources = [source for source in PUBLISHED if source.startswith(f"{system},")]
         header += [system, *sources]
@@ -259,7 +263,14 @@ def score_table(groups, tasks, systems):
             group = groups.get((row[0], system, ""))
             ours = f"{mean_and_std(group.last_ten())} ({group.size})" if group else "-"
             row += [ours, *(published(source, row[0]) for source in sources)]
-    return markdown(header, rows)
+    for row, known in zip(rows, data.values(), strict=True):
+        kind = row[0].partition("-")[2]
+        row.append(
+            f"{int(known['transitions']):,}, {OUR_DATA.get(kind, 'own')}"
+            if known
+            else "-"
+        )
+    return markdown([*header, "whose data"], rows)
 
 
 def difference(group, other):
@@ -287,30 +298,20 @@ def difference_table(groups, tasks, systems):
     return markdown(["task", *(f"{first} - {other}" for other in others)], rows)
 
 
-def interquartile_mean(*tasks, axis=-1):
-    return stats.trim_mean(np.concatenate(tasks, axis=axis), 0.25, axis=axis)
-
-
-def interquartile_table(groups, systems):
-    """A row for each set of tasks on which all systems have as many seeds and steps,
-    with a 95% interval by the stratified bootstrap (Agarwal et al., NeurIPS 2021)."""
-    alike, rows = {}, []
-    for task in TASKS:
-        of_task = [groups[task, s, ""] for s in systems if (task, s, "") in groups]
-        kinds = {(group.size, group.data) for group in of_task}
-        if len(of_task) == len(systems) and len(kinds) == 1 and len(of_task[0].q) > 1:
-            alike.setdefault(of_task[0].size, []).append(of_task)
-    for size, of_tasks in alike.items():
-        row = [f"{', '.join(of_task[0].task for of_task in of_tasks)} ({size})"]
-        for of_system in zip(*of_tasks, strict=True):
-            x = [group.last_ten() for group in of_system]
-            options = {"method": "percentile", "n_resamples": 20_000, "rng": 0}
-            test = stats.bootstrap(x, interquartile_mean, **options)
-            low, high = test.confidence_interval
-            row.append(f"{interquartile_mean(*x):.1f} [{low:.1f}, {high:.1f}]")
-        if len(of_tasks) > 1:
+def totals_table(groups, systems):
+    """Sums over the tasks of Table 1 that a system has runs on, ours and published."""
+    rows = []
+    for system in systems:
+        tasks = [task for task in TASKS if (task, system, "") in groups]
+        ours = sum(groups[task, system, ""].last_ten().mean() for task in tasks)
+        row = [system, str(len(tasks)), f"{ours:.1f}"]
+        for source, summed in (("paper", tasks), ("CORL", tasks), ("paper", TASKS)):
+            scores = [published(f"{system}, {source}", task) for task in summed]
+            row.append("-" if "-" in scores else f"{sum(map(float, scores)):.1f}")
+        if tasks:
             rows.append(row)
-    return markdown(["tasks", *systems], rows)
+    header = ["system", "tasks", "these runs", "paper", "CORL", "paper, all twelve"]
+    return markdown(header, rows)
 
 
 def span(values, form):
@@ -376,26 +377,28 @@ def panel(groups, task, systems, column):
 
 
 def runaway_panels(groups):
-    """Q and scores of wPC with several alphas, or on parts of a dataset."""
-    families = {}
+    """Q and scores of wPC on the tasks that have runs of several alphas."""
+    tasks = {}
     for group in groups.values():
         of_alpha = group.system == "wPC" and re.fullmatch(r"(alpha \S+)?", group.others)
         if of_alpha and group.best_return > 0:
-            family = re.sub(r"-\d+k?$", "", group.task)
-            families.setdefault(family, []).append(group)
-    shown = itertools.chain(*(x for x in families.values() if len(x) > 1))
-    shown = sorted(shown, key=lambda group: -group.alpha)
-    alphas = dict.fromkeys(group.alpha for group in shown)
+            tasks.setdefault(group.task, []).append(group)
+    tasks = {task: shown for task, shown in tasks.items() if len(shown) > 1}
+    alphas = sorted({x.alpha for shown in tasks.values() for x in shown}, reverse=True)
     styles = dict(zip(alphas, itertools.cycle(SYSTEMS.values()), strict=False))
-    q_panels, score_panels = {}, {}
-    for group in shown:
-        curve = f"alpha {group.alpha}", styles[group.alpha], group.steps
-        task, ratio = group.task, group.q / group.best_return
-        empty = task, "Q / best return in the data", [], [(1, "black", "--")]
-        q_panels.setdefault(task, empty)[2].append((*curve, band(ratio)))
-        empty = task, "score", [], []
-        score_panels.setdefault(task, empty)[2].append((*curve, band(group.scores)))
-    return [*q_panels.values(), *score_panels.values()]
+    panels = []
+    for ylabel, levels in (
+        ("Q / best return in the data", [(1, "black", "--")]),
+        ("score", []),
+    ):
+        for task, shown in tasks.items():
+            curves = []
+            for group in sorted(shown, key=lambda group: -group.alpha):
+                x = group.scores if ylabel == "score" else group.q / group.best_return
+                style = styles[group.alpha]
+                curves.append((f"alpha {group.alpha}", style, group.steps, band(x)))
+            panels.append((task, ylabel, curves, levels))
+    return panels
 
 
 def reproduction_panel(group, curve):
@@ -427,6 +430,9 @@ def draw(path, panels):
         axis.autoscale_view()
         axis.set(title=title, xlabel="training steps (thousands)", ylabel=ylabel)
         axis.grid(alpha=0.3)
+        if not curves:
+            axis.text(0.5, 0.5, "no run yet", ha="center", transform=axis.transAxes)
+            axis.set(xticks=[], yticks=[], xlabel=None, ylabel=None)
     for axis in axes.flat[len(panels) :]:
         axis.remove()
     figure.legend(
@@ -448,15 +454,17 @@ INTRODUCTION = """\
 Scores are D4RL's normalized ones, or returns where a task is called "(mean return)". A
 score is the mean of a run's last ten evaluations; over seeds: mean ± sample standard
 deviation (seeds; training steps). What the paper and CORL have published is of D4RL's
-own files. "The data" is the mean score of the episodes trained on, where the report
-knows it (tests/results/datasets.csv). Runs whose arguments, other than --weight, differ
-from the scripts' defaults are in the table on Q alone.
+own files. "The data" is the mean score of the episodes trained on and "whose data" the
+number of transitions and whom they are of, where the report knows them
+(tests/results/datasets.csv). Runs whose arguments, other than --weight, differ from the
+scripts' defaults are in the table on Q alone.
 """
 NOTES = {
     "Differences": "Mean, 95% interval and p of Welch's t test, not corrected for "
     "the number of tests (seeds of each; steps).",
-    "Interquartile means": "Over all runs of the tasks on which the systems have as "
-    "many seeds and steps; 95% interval by a bootstrap over the seeds of each task.",
+    "Totals": "Over the tasks of Table 1 on which a system has runs here, which are "
+    "not the same for all systems; beside them what is published for the same tasks. "
+    "(Of all twelve, the paper prints 711.4 for wBC, but its scores add up to 712.7.)",
     "When does Q run away?": "Q (its mean over a batch) divided by the best discounted "
     "return-to-go of the data, from the lowest to the highest seed: the mean "
     "of the last ten evaluations, the largest and its step; how many seeds had it over "
@@ -486,18 +494,19 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
     path = ROOT / "tests/results/td3_bc_on_d4rl.csv"
     options = {"delimiter": ",", "dtype": None, "encoding": "utf-8"}
     on_d4rl = np.genfromtxt(path, names=True, skip_header=4, **options)
-    pairs = []
-    for task in tasks_of("TD3+BC"):
-        group, curve = groups[task, "TD3+BC", ""], on_d4rl[on_d4rl["task"] == task]
-        if np.isin(group.steps, curve["step"]).any():
-            pairs.append((group, curve))
+    td3_bc = (groups[task, "TD3+BC", ""] for task in tasks_of("TD3+BC"))
+    pairs = [(group, on_d4rl[on_d4rl["task"] == group.task]) for group in td3_bc]
+    pairs = [pair for pair in pairs if np.isin(pair[0].steps, pair[1]["step"]).any()]
 
+    all_tasks = tasks_of(*COMPARED, "BC")
+    if set(all_tasks) & set(TASKS):
+        all_tasks = list(dict.fromkeys([*TASKS, *all_tasks]))
     table_1, weights = [*COMPARED, "BC"], ["wPC", "TD3+BC", *OF_WEIGHTS.values()]
     others = tasks_of(*OF_WEIGHTS.values())
     tables = {
-        "Table 1": score_table(groups, tasks_of(*table_1), table_1),
+        "Table 1": score_table(groups, all_tasks, table_1),
+        "Totals": totals_table(groups, table_1),
         "Differences": difference_table(groups, tasks_of(*COMPARED), COMPARED),
-        "Interquartile means": interquartile_table(groups, COMPARED),
         "Other weights (Table 2, Figure 4)": score_table(groups, others, weights),
         "Differences to other weights": difference_table(
             groups, others, ["wPC", *OF_WEIGHTS.values()]
@@ -513,20 +522,22 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
     (out / "tables.md").write_text(text)
     print(f"{text}\nwrote {out / 'tables.md'}")
 
-    compared, static = tasks_of(*COMPARED, at_least=2), tasks_of("static weight")
-    figure4 = itertools.product(static, ("q", "scores"))
-    figure5 = tasks_of("wPC-e", "wPC-rnd")
+    def panels(tasks, systems, *columns):
+        pairs = itertools.product(tasks, columns)
+        return [panel(groups, task, systems, column) for task, column in pairs]
+
+    static = tasks_of("static weight")
     figures = {
-        "figure2": [panel(groups, task, COMPARED, "scores") for task in compared],
-        "figure3": [panel(groups, task, COMPARED, "q") for task in compared],
-        "figure4": [panel(groups, t, ["wPC", "static weight"], x) for t, x in figure4],
-        "figure5": [panel(groups, task, weights[:4], "scores") for task in figure5],
+        "figure2": panels(all_tasks, COMPARED, "scores"),
+        "figure3": panels(tasks_of(*COMPARED, at_least=2), COMPARED, "q"),
+        "figure4": panels(static, ["wPC", "static weight"], "q", "scores"),
+        "figure5": panels(tasks_of("wPC-e", "wPC-rnd"), weights[:4], "scores"),
         "runaway": runaway_panels(groups),
         "reproduction": [reproduction_panel(*pair) for pair in pairs],
     }
-    for name, panels in figures.items():
-        if panels:
-            draw(out / f"{name}.png", panels)
+    for name, drawn in figures.items():
+        if any(curves for _, _, curves, _ in drawn):
+            draw(out / f"{name}.png", drawn)
 
 
 def main(arguments=None):

@@ -30,7 +30,7 @@ import sys
 import tempfile
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import h5py
@@ -43,6 +43,15 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import wpc
+
+
+def usable_cpus():
+    """How many CPUs this process may use; a job on a cluster often has few of many."""
+    if hasattr(os, "process_cpu_count"):  # since Python 3.13
+        return os.process_cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @dataclass
@@ -61,8 +70,8 @@ class Args:
     """D4RL file that records its policy, or an .npz of the same names (fc0.weight)"""
     random: bool = False
     """take uniform actions"""
-    workers: int = os.cpu_count() or 1
-    """number of processes that collect"""
+    workers: int = field(default_factory=usable_cpus)
+    """number of processes that collect; by default as many as there are CPUs to use"""
 
     # SAC
     random_steps: int = 5_000
@@ -343,6 +352,8 @@ def write(args, data):
 
 
 def main(args):
+    # What a cluster sends before a job's time is over acts as Ctrl-C does.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try_to_write(args.out)
     env = make_env(args.env)  # exits if the scripts can't use it
     states = np.zeros((args.steps, *env.observation_space.shape), np.float32)
@@ -371,4 +382,7 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    try:
+        main(tyro.cli(Args, description=__doc__))
+    except getattr(wpc, "UserError", ()) as error:
+        sys.exit(str(error))

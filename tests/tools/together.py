@@ -24,13 +24,12 @@ import io
 import itertools
 import json
 import multiprocessing
-import os
 import re
 import shlex
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -47,6 +46,7 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from compiled import TraceableAdam
+from make_dataset import usable_cpus
 
 import wpc
 
@@ -59,8 +59,8 @@ class Options:
     """file of lines such as "python wpc.py --env ... --run-dir ...", a run each"""
     seconds: float = float("inf")
     """stop training after this time; what was evaluated until then is kept"""
-    workers: int = max(1, (os.cpu_count() or 2) - 2)
-    """number of processes that evaluate"""
+    workers: int = field(default_factory=lambda: max(1, usable_cpus() - 2))
+    """number of processes that evaluate; by default two fewer than there are CPUs"""
     tf32: bool = False
     """multiply matrices in TF32, which is faster, with 10 instead of 23 bits"""
     device: str = "cuda" if torch.cuda.is_available() else "cpu"
@@ -569,4 +569,7 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except getattr(wpc, "UserError", ()) as error:
+        sys.exit(str(error))

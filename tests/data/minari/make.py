@@ -2,7 +2,7 @@
 """Made the Minari datasets in tests/data/minari, with Minari's own DataCollector:
 
     pip install "minari[create,hdf5]==0.5.4" "gymnasium[mujoco]==1.4.0" mujoco==3.15.0
-    MINARI_DATASETS_PATH=$PWD/tests/data/minari python tests/tools/make_minari_data.py
+    MINARI_DATASETS_PATH=$PWD/tests/data/minari python tests/data/minari/make.py
 
 DataCollector needs JAX, which nothing else here does; hence the datasets are stored.
 """
