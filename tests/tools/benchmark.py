@@ -24,7 +24,7 @@ import torch
 import torch.nn.functional as F
 import tyro
 from check_steps import load
-from compiled import compile_update
+from compiled import Cycles
 from tqdm import trange
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -52,7 +52,6 @@ def script_steps(script, compiled):
     """A script's own sampling and update."""
     args = script.Args(device="cpu")
     agent = script.Agent(STATE_DIM, ACTION_DIM, 1.0, args)
-    update = compile_update(agent, script.Agent.update) if compiled else agent.update
     dataset = {
         "observations": torch.randn(ROWS, STATE_DIM),
         "actions": torch.rand(ROWS, ACTION_DIM) * 2 - 1,
@@ -60,7 +59,10 @@ def script_steps(script, compiled):
         "next_observations": torch.randn(ROWS, STATE_DIM),
         "terminals": torch.zeros(ROWS, 1),
     }
-    return lambda i: update(script.sample_batch(dataset, BATCH), i)
+    if compiled:
+        steps = Cycles(agent, script.Agent.update, script.sample_batch)
+        return lambda i: steps(dataset, i)
+    return lambda i: agent.update(script.sample_batch(dataset, BATCH), i)
 
 
 class Buffer:
