@@ -100,6 +100,25 @@ def test_the_traced_step_is_the_step(float64, monkeypatch, script, options):
     torch.testing.assert_close(traced, eager, rtol=1e-9, atol=1e-12)
 
 
+def test_no_cycle_runs_past_an_evaluation(float64, monkeypatch):
+    """Where the script evaluates and saves, all is as it is after that step."""
+    compile_traced(monkeypatch)
+    args = td3_bc.Args(device="cpu", batch_size=32, eval_freq=5, max_timesteps=13)
+    found = []
+    for kind in (one_by_one, compiled.Cycles):
+        torch.manual_seed(0)
+        agent = td3_bc.Agent(5, 2, 1.0, args)
+        steps = kind(agent, td3_bc.Agent.update, td3_bc.sample_batch)
+        dataset, saved = random_batch(), []
+        for step in range(1, 14):
+            steps(dataset, step)
+            if step in (5, 10, 13):
+                saved.append((copy.deepcopy(state(agent)), torch.get_rng_state()))
+        found.append(saved)
+    torch.testing.assert_close(*found, rtol=1e-9, atol=1e-12)
+    assert steps.compiled
+
+
 def test_the_random_weight_is_the_scripts():
     weight, args = torch.rand(50, 1), wpc.Args(weight="random")
     torch.manual_seed(0)
@@ -340,6 +359,7 @@ def test_the_benchmark_compiles_what_it_calls_compiled(monkeypatch):
         "Cycles",
         lambda agent, update, sample: lambda dataset, step: updates.append(update),
     )
+    monkeypatch.setattr(benchmark, "d3rlpy", None)
     made = benchmark.variants(benchmark.Args(), threads=1)
     for script in SCRIPTS.values():
         made[f"compiled {script.__name__}.py"].step(1)
@@ -402,6 +422,21 @@ def test_a_peer_is_measured_on_the_cpu(tmp_path):
         "        assert len(buffer.sample(batch_size)) == 5\n"
     )
     assert benchmark.Steps(benchmark.peer_steps(tmp_path / "peer.py")).run(2) > 0
+
+
+def test_an_older_tool_is_measured(tmp_path):
+    (tmp_path / "compiled.py").write_text(
+        "def compile_update(agent, update):\n"
+        "    return lambda batch, step: update(agent, batch, step)\n"
+    )
+    older = benchmark.module(tmp_path / "compiled.py")
+    steps = benchmark.script_steps(td3_bc, older=older)
+    assert benchmark.Steps(steps).run(2) > 0
+
+
+def test_d3rlpy_is_measured():
+    pytest.importorskip("d3rlpy")
+    assert benchmark.Steps(benchmark.d3rlpy_steps()).run(2) > 0
 
 
 def test_the_benchmarks_table(monkeypatch, capsys):
