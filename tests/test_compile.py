@@ -67,25 +67,28 @@ def state(agent):
     return {k: x.state_dict() for k, x in vars(agent).items() if k != "args"}
 
 
-def one_by_one(agent, update, sample_batch):
-    """The script's own steps, called as those of `Cycles`."""
-    return lambda data, step: update(agent, sample_batch(data, 32), step)
-
-
-def twenty_steps(script, args, kind=one_by_one):
-    """The metrics of each step, what is saved after the last, and the random state."""
+def twenty_steps(script, args, compile_update=None):
+    """The metrics of each step, and what is saved after the last."""
     torch.manual_seed(0)
     agent = script.Agent(5, 2, 1.0, args)
-    steps = kind(agent, script.Agent.update, script.sample_batch)
-    dataset, metrics = random_batch(), []
+    update = agent.update
+    if compile_update:
+        update = compile_update(agent, script.Agent.update)
+    metrics = []
     for step in range(1, 21):
-        metrics.append({k: x.item() for k, x in steps(dataset, step).items()})
-    return metrics, state(agent), torch.get_rng_state()
+        metrics.append({k: x.item() for k, x in update(random_batch(), step).items()})
+    return metrics, state(agent)
 
 
 def compile_traced(monkeypatch):
-    """From here on, what is traced is not compiled."""
-    monkeypatch.setattr(compiled, "compile_fx", lambda graph, *_, **__: graph)
+    """From here on, torch.compile traces and does not compile what it has traced."""
+    real_compile = torch.compile
+
+    def only_trace(function, options, **arguments):
+        return real_compile(function, backend="eager", **arguments)
+
+    monkeypatch.setattr(torch, "compile", only_trace)
+    torch._dynamo.reset()
 
 
 @pytest.mark.parametrize("script, options", VARIANTS)
@@ -94,29 +97,10 @@ def test_the_traced_step_is_the_step(float64, monkeypatch, script, options):
     if script is wpc:
         gathered = compiled.gathered(wpc.other_weight)
         monkeypatch.setattr(wpc, "other_weight", gathered)
-    args = script.Args(device="cpu", batch_size=32, eval_freq=20, **options)
+    args = script.Args(device="cpu", **options)
     eager = twenty_steps(script, args)
-    traced = twenty_steps(script, args, compiled.Cycles)
+    traced = twenty_steps(script, args, compiled.compile_update)
     torch.testing.assert_close(traced, eager, rtol=1e-9, atol=1e-12)
-
-
-def test_no_cycle_runs_past_an_evaluation(float64, monkeypatch):
-    """Where the script evaluates and saves, all is as it is after that step."""
-    compile_traced(monkeypatch)
-    args = td3_bc.Args(device="cpu", batch_size=32, eval_freq=5, max_timesteps=13)
-    found = []
-    for kind in (one_by_one, compiled.Cycles):
-        torch.manual_seed(0)
-        agent = td3_bc.Agent(5, 2, 1.0, args)
-        steps = kind(agent, td3_bc.Agent.update, td3_bc.sample_batch)
-        dataset, saved = random_batch(), []
-        for step in range(1, 14):
-            steps(dataset, step)
-            if step in (5, 10, 13):
-                saved.append((copy.deepcopy(state(agent)), torch.get_rng_state()))
-        found.append(saved)
-    torch.testing.assert_close(*found, rtol=1e-9, atol=1e-12)
-    assert steps.compiled
 
 
 def test_the_random_weight_is_the_scripts():
@@ -200,19 +184,18 @@ def test_compiled_runs(tmp_path):
 def test_a_plain_run_goes_on_compiled(float64, monkeypatch, script):
     """With Adam's state as the script's own steps have left it."""
     compile_traced(monkeypatch)
-    args, dataset = script.Args(device="cpu", batch_size=32), random_batch()
+    args = script.Args(device="cpu")
     agents = []
     for compiles in (False, True):
         torch.manual_seed(0)
         agent = script.Agent(5, 2, 1.0, args)
-        functions = script.Agent.update, script.sample_batch
-        steps = one_by_one(agent, *functions)
+        update = agent.update
         for step in range(1, 11):
             if compiles and step == 5:
                 for name in ("actor", "critic", "value"):  # as in a new process
                     getattr(agent, name, agent.actor).zero_grad()
-                steps = compiled.Cycles(agent, *functions)
-            steps(dataset, step)
+                update = compiled.compile_update(agent, script.Agent.update)
+            update(random_batch(), step)
         agents.append(state(agent))
     torch.testing.assert_close(*agents, rtol=1e-9, atol=1e-12)
 
@@ -264,25 +247,31 @@ def test_the_script_that_is_named_is_run(tmp_path):
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
 def test_what_a_script_does_otherwise(monkeypatch, script, device):
-    """Each step gets the dataset, and samples."""
+    """On a CPU the update alone; on a GPU sampling, too, which gets the dataset."""
     done = []
 
     class Agent:
         args = types.SimpleNamespace(device=device)
         update = script.Agent.update
 
-    def steps(agent, update, sample_batch):
+    def graphs(agent, update, sample_batch):
         assert sample_batch is script.sample_batch
         return lambda dataset, step: done.append((update, dataset, step))
 
+    def compile_update(agent, update):
+        return lambda batch, step: done.append((update, batch, step))
+
     module = types.SimpleNamespace(**vars(script) | {"Agent": Agent})
-    monkeypatch.setattr(compiled, "Graphs", steps if device == "cuda" else None)
-    monkeypatch.setattr(compiled, "Cycles", steps if device == "cpu" else None)
+    monkeypatch.setattr(compiled, "Graphs", graphs if device == "cuda" else None)
+    cpu = compile_update if device == "cpu" else None
+    monkeypatch.setattr(compiled, "compile_update", cpu)
     compiled.install(module)
-    dataset = {"rewards": torch.ones(9)}
-    assert module.sample_batch(dataset, 4) is dataset
-    Agent().update(dataset, 7)
-    assert done == [(script.Agent.update, dataset, 7)]
+    rewards = types.SimpleNamespace(is_cuda=True) if device == "cuda" else torch.ones(9)
+    dataset = {"rewards": rewards}
+    batch = module.sample_batch(dataset, 4)
+    Agent().update(batch, 7)
+    assert done == [(script.Agent.update, batch, 7)]
+    assert batch is dataset if device == "cuda" else len(batch["rewards"]) == 4
 
 
 class PretendGraph:
@@ -356,10 +345,9 @@ def test_the_benchmark_compiles_what_it_calls_compiled(monkeypatch):
         monkeypatch.setattr(benchmark, name, lambda: None)
     monkeypatch.setattr(
         benchmark,
-        "Cycles",
-        lambda agent, update, sample: lambda dataset, step: updates.append(update),
+        "compile_update",
+        lambda agent, update: lambda batch, step: updates.append(update),
     )
-    monkeypatch.setattr(benchmark, "d3rlpy", None)
     made = benchmark.variants(benchmark.Args(), threads=1)
     for script in SCRIPTS.values():
         made[f"compiled {script.__name__}.py"].step(1)
@@ -422,21 +410,6 @@ def test_a_peer_is_measured_on_the_cpu(tmp_path):
         "        assert len(buffer.sample(batch_size)) == 5\n"
     )
     assert benchmark.Steps(benchmark.peer_steps(tmp_path / "peer.py")).run(2) > 0
-
-
-def test_an_older_tool_is_measured(tmp_path):
-    (tmp_path / "compiled.py").write_text(
-        "def compile_update(agent, update):\n"
-        "    return lambda batch, step: update(agent, batch, step)\n"
-    )
-    older = benchmark.module(tmp_path / "compiled.py")
-    steps = benchmark.script_steps(td3_bc, older=older)
-    assert benchmark.Steps(steps).run(2) > 0
-
-
-def test_d3rlpy_is_measured():
-    pytest.importorskip("d3rlpy")
-    assert benchmark.Steps(benchmark.d3rlpy_steps()).run(2) > 0
 
 
 def test_the_benchmarks_table(monkeypatch, capsys):

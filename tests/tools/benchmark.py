@@ -8,12 +8,10 @@ matrix products of a step, and other people's files.
 
 The second line also measures files of github.com/sfujim/TD3_BC, github.com/qsa-fox/wPC
 and github.com/nissymori/JAX-CORL, which you download yourself; the last needs jax,
-flax, optax, omegaconf and pydantic. d3rlpy's TD3PlusBC is measured where it is
-installed. All variants take turns, so that other load
+flax, optax, omegaconf and pydantic. All variants take turns, so that other load
 slows all of them alike. The table has ratios of medians, and the medians.
 """
 
-import importlib.util
 import os
 import subprocess
 import sys
@@ -26,13 +24,8 @@ import torch
 import torch.nn.functional as F
 import tyro
 from check_steps import load
-from compiled import Cycles
+from compiled import compile_update
 from tqdm import trange
-
-try:
-    import d3rlpy
-except ImportError:
-    d3rlpy = None
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import td3_bc
@@ -53,22 +46,13 @@ class Args:
     """other files to measure, with a class TD3_BC as TD3_BC.py has it"""
     jax: Path | None = None
     """JAX-CORL's td3bc.py"""
-    older: Path | None = None
-    """an older compiled.py, with compile_update, to compare the present one with"""
 
 
-def module(path):
-    """The file as a module, under a name that no other has."""
-    spec = importlib.util.spec_from_file_location("older", path)
-    older = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(older)
-    return older
-
-
-def script_steps(script, compiled=False, older=None):
-    """A script's own sampling and update, perhaps compiled by this or an older tool."""
+def script_steps(script, compiled):
+    """A script's own sampling and update."""
     args = script.Args(device="cpu")
     agent = script.Agent(STATE_DIM, ACTION_DIM, 1.0, args)
+    update = compile_update(agent, script.Agent.update) if compiled else agent.update
     dataset = {
         "observations": torch.randn(ROWS, STATE_DIM),
         "actions": torch.rand(ROWS, ACTION_DIM) * 2 - 1,
@@ -76,12 +60,6 @@ def script_steps(script, compiled=False, older=None):
         "next_observations": torch.randn(ROWS, STATE_DIM),
         "terminals": torch.zeros(ROWS, 1),
     }
-    if compiled:
-        steps = Cycles(agent, script.Agent.update, script.sample_batch)
-        return lambda i: steps(dataset, i)
-    update = agent.update
-    if older:
-        update = older.compile_update(agent, script.Agent.update)
     return lambda i: update(script.sample_batch(dataset, BATCH), i)
 
 
@@ -104,23 +82,6 @@ def peer_steps(path):
     peer.device = torch.device("cpu")  # as the scripts, also where there is a GPU
     agent = peer.TD3_BC(STATE_DIM, ACTION_DIM, 1.0)
     return lambda i: agent.train(buffer, BATCH)
-
-
-def d3rlpy_steps():
-    """The loop of TD3PlusBC.fit, without its log."""
-    observations, actions, _, rewards, _ = Buffer().arrays
-    ends = np.arange(1, ROWS + 1) % 1000 == 0
-    nothing = np.zeros(ROWS)
-    dataset = d3rlpy.dataset.MDPDataset(
-        observations.astype(np.float32),
-        actions.astype(np.float32),
-        rewards.astype(np.float32),
-        nothing,
-        ends,
-    )
-    agent = d3rlpy.algos.TD3PlusBCConfig(batch_size=BATCH).create()
-    agent.build_with_dataset(dataset)
-    return lambda i: agent.update(dataset.sample_transition_batch(BATCH))
 
 
 JAX = """
@@ -287,14 +248,9 @@ def variants(args, threads):
     made = {"textbook": Steps(textbook_steps()), "products": Steps(product_steps())}
     for script in (wpc, td3_bc, wbc):
         name = script.SCRIPT.name
-        made[name] = Steps(script_steps(script))
+        made[name] = Steps(script_steps(script, compiled=False))
         made[f"compiled {name}"] = Steps(script_steps(script, compiled=True))
-        if args.older:
-            older = module(args.older)
-            made[f"older compiled {name}"] = Steps(script_steps(script, older=older))
     made |= {path.name: Steps(peer_steps(path)) for path in args.peers}
-    if d3rlpy:
-        made["d3rlpy's TD3PlusBC"] = Steps(d3rlpy_steps())
     if args.jax:
         made["JAX-CORL"] = JaxSteps(args.jax, threads, True)
         made["JAX-CORL, no LayerNorm"] = JaxSteps(args.jax, threads, False)

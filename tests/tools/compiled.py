@@ -4,11 +4,11 @@
     python tests/tools/compiled.py wpc.py --env hopper-medium-v2 --alpha 2.5
 
 Arguments, run folder and checkpoints are the script's, and a run may go on with this
-tool or without it. On a CPU, policy_freq steps are compiled as one by torch.compile's
-compiler, which needs one for C++ and takes about a minute the first time; results agree
-with the script's but for rounding. On a GPU, each step is captured as a CUDA graph, and
-results should be the same to the last bit. Scripts may be edited, but `update` must do
-the same in all steps that policy_freq divides, and the same in all others.
+tool or without it. On a CPU, `Agent.update` is compiled by torch.compile, which needs a
+C++ compiler and takes about a minute the first time; results agree with the script's
+but for rounding. On a GPU, sampling and update are captured as CUDA graphs, and results
+should be the same to the last bit. Scripts may be edited, but `update` must do the same
+in all steps that policy_freq divides, and the same in all others.
 """
 
 import copy
@@ -20,10 +20,8 @@ import tempfile
 from pathlib import Path
 
 import torch
-from torch._inductor.compile_fx import compile_fx
-from torch.fx.experimental.proxy_tensor import make_fx
 
-# --- CPU: torch.compile's compiler ----------------------------------------------------
+# --- CPU: torch.compile ---------------------------------------------------------------
 
 
 class TraceableAdam:
@@ -80,79 +78,25 @@ def gathered(other_weight):
     return with_gather
 
 
-class Cycles:
-    """As many steps as policy_freq says in one call of compiled code, sampling too.
+def compile_update(agent, update):
+    """`update` on the agent, each step one graph, with the same random numbers."""
+    torch._dynamo.config.trace_autograd_ops = True  # lets backward() into the graph
+    twin = copy.copy(agent)  # with the same networks and state of the optimizers
+    optimizers = {k: x for k, x in vars(agent).items() if k.endswith("_optimizer")}
+    for name, optimizer in optimizers.items():
+        setattr(twin, name, TraceableAdam(optimizer))
 
-    So a call's cost, which grows with the number of tensors, is paid less often; the
-    random numbers are the same. Steps that no cycle has room for before an evaluation,
-    or that follow one in the middle of a cycle, are done one by one, not compiled.
-    """
-
-    def __init__(self, agent, update, sample_batch):
-        self.update, self.sample_batch, self.ready = update, sample_batch, {}
-        self.agent = copy.copy(agent)  # with the same networks and state of optimizers
-        self.compiled, self.optimizers = None, []
-        for name, optimizer in vars(agent).items():
-            if name.endswith("_optimizer"):
-                self.optimizers.append(TraceableAdam(optimizer))
-                setattr(self.agent, name, self.optimizers[-1])
-
-    def one_step(self, dataset, step):
-        batch = self.sample_batch(dataset, self.agent.args.batch_size)
-        metrics = self.update(self.agent, batch, step)
-        for optimizer in self.optimizers:  # the critics' gradients of the policy's
-            optimizer.zero_grad()  # loss, too, which then need not be computed
+    def one_step(batch, step):
+        metrics = update(twin, batch, step)
+        for name in optimizers:  # the critics' gradients of the policy's loss, too,
+            getattr(twin, name).zero_grad()  # which then need not be computed
         return {name: metric.detach() for name, metric in metrics.items()}
 
-    def compile(self, dataset):
-        """Traces a cycle by doing it, which is then undone, and compiles it."""
-        print("the first steps are compiled, which may take a minute", flush=True)
-        tensors = []
-        for part in vars(self.agent).values():
-            if isinstance(part, torch.nn.Module):
-                tensors += [*part.parameters(), *part.buffers()]
-        for adam in self.optimizers:
-            tensors += [adam.beta1_power, adam.beta2_power]
-            tensors += [x for state in adam.states for x in state.values()]
-        inputs = [x.detach() for x in (*tensors, *dataset.values())]  # the same memory
-
-        def cycle(*_):
-            steps = range(1, self.agent.args.policy_freq + 1)
-            metrics = [self.one_step(dataset, step) for step in steps]
-            self.names = [list(x) for x in metrics]
-            return [metric for x in metrics for metric in x.values()]
-
-        before = [x.detach().clone() for x in tensors]
-        with torch.random.fork_rng(devices=[]):
-            graph = make_fx(cycle)(*tensors, *dataset.values())
-        for tensor, value in zip(inputs, before, strict=False):
-            tensor.copy_(value)
-        for node in graph.graph.nodes:
-            node.meta.pop("val", None)  # or compile_fx finds more than one fake mode
-            if node.op == "get_attr":
-                raise NotImplementedError("compiled.py knows no tensors but networks'")
-        options = {"cpp_wrapper": True, "fallback_random": True}
-        with torch.no_grad():
-            compiled = compile_fx(graph, inputs, config_patches=options)
-        self.compiled = lambda: compiled(*inputs)
-
-    @torch.no_grad()
-    def cycle(self, step):
-        values = iter(self.compiled())
-        for i, names in enumerate(self.names):
-            self.ready[step + i] = {name: next(values) for name in names}
-
-    def __call__(self, dataset, step):
-        args = self.agent.args
-        if step not in self.ready:
-            evaluation = min(step + -step % args.eval_freq, args.max_timesteps)
-            fits = step + args.policy_freq - 1 <= evaluation
-            if (step - 1) % args.policy_freq or not fits:
-                return self.one_step(dataset, step)
-            if self.compiled is None:
-                self.compile(dataset)
-            self.cycle(step)
-        return self.ready.pop(step)
+    options = {"cpp_wrapper": True, "fallback_random": True}
+    compiled = torch.compile(one_step, fullgraph=True, dynamic=False, options=options)
+    # One graph for the steps that update the policy, one for all the others.
+    freq = agent.args.policy_freq
+    return lambda batch, step: compiled(batch, 1 if step % freq else freq)
 
 
 # --- GPU: CUDA graphs -----------------------------------------------------------------
@@ -210,17 +154,21 @@ def install(script):
     if hasattr(script, "other_weight"):
         script.other_weight = gathered(script.other_weight)
 
-    def compiled_update(agent, dataset, step):
-        if agent not in steps:
-            kind = Graphs if agent.args.device == "cuda" else Cycles
-            steps[agent] = kind(agent, update, sample_batch)
-        return steps[agent](dataset, step)
+    def compiled_update(agent, batch, step):
+        if agent not in steps and agent.args.device == "cuda":
+            steps[agent] = Graphs(agent, update, sample_batch)
+        elif agent not in steps:
+            print("the first steps are compiled, which may take a minute", flush=True)
+            steps[agent] = compile_update(agent, update)
+        return steps[agent](batch, step)
 
-    # Sampling is a part of the step, which gets the dataset itself.
-    script.Agent.update, script.sample_batch = (
-        compiled_update,
-        lambda dataset, _: dataset,
-    )
+    def sample(dataset, batch_size):
+        """On a GPU the dataset itself, as sampling is a part of the graph."""
+        if dataset["rewards"].is_cuda:
+            return dataset
+        return sample_batch(dataset, batch_size)
+
+    script.Agent.update, script.sample_batch = compiled_update, sample
 
 
 def main():
