@@ -42,7 +42,8 @@ def write(path, arrays):
 def transitions(path):
     """Of wpc.py, each a row: state, action, reward, next state, terminal."""
     args = wpc.Args("hopper", str(path), device="cpu")
-    data, mean, std, _ = wpc.load_dataset(path, 11, 3, 1.0, args)
+    arrays = wpc.read_dataset(path, 11, 3, 1.0)
+    data, mean, std, _ = wpc.prepare_dataset(arrays, args)
     for name in ("observations", "next_observations"):
         data[name] = data[name] * std + mean
     names = ("observations", "actions", "rewards", "next_observations", "terminals")

@@ -119,7 +119,7 @@ def test_margins_are_halved_and_collisions_keep_the_capsules(robot):
         assert np.array_equal(getattr(model, name), getattr(stock, name))
 
 
-@pytest.mark.parametrize(("version", "divisor"), [(340, 1), (350, 2), (3015000, 2)])
+@pytest.mark.parametrize(("version", "divisor"), [(340, 1), (3005000, 2), (3015000, 2)])
 def test_margins_are_halved_where_mujoco_adds_them(
     script, version, divisor, monkeypatch
 ):

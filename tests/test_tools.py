@@ -485,7 +485,7 @@ def make(tmp_path, monkeypatch):
 
 def assert_nothing_is_lost(path, dataset, state_dim, action_dim):
     """The scripts make Minari's transitions of the file, and know its episodes."""
-    args = wpc.Args(env="hopper", weight="static")
+    args = wpc.Args(weight="static")
     arrays = wpc.read_dataset(path, state_dim, action_dim, 2.0)
     data, mean, std, _ = wpc.prepare_dataset(arrays, args)
     for key in ("observations", "next_observations"):
@@ -541,7 +541,7 @@ def test_no_transition_is_lost_if_all_episodes_are_terminal(tmp_path, make):
     # As the scripts drop the last row, there must be one that belongs to no episode.
     name = make(*(buffer(i, 3 + i, True) for i in range(3)))
     convert(name, tmp_path / "data.hdf5")
-    args = wpc.Args(env="hopper")
+    args = wpc.Args()
     arrays = wpc.read_dataset(tmp_path / "data.hdf5", 3, 1, 2.0)
     data, *_ = wpc.prepare_dataset(arrays, args)
     rewards = np.concatenate([buffer(i, 3 + i).rewards for i in range(3)])

@@ -155,7 +155,7 @@ def install(script):
         script.other_weight = gathered(script.other_weight)
 
     def compiled_update(agent, batch, step):
-        if agent not in steps and agent.args.device == "cuda":
+        if agent not in steps and agent.args.device.startswith("cuda"):
             steps[agent] = Graphs(agent, update, sample_batch)
         elif agent not in steps:
             print("the first steps are compiled, which may take a minute", flush=True)

@@ -384,5 +384,5 @@ def main(args):
 if __name__ == "__main__":
     try:
         main(tyro.cli(Args, description=__doc__))
-    except getattr(wpc, "UserError", ()) as error:
+    except wpc.UserError as error:
         sys.exit(str(error))

@@ -571,5 +571,5 @@ def main():
 if __name__ == "__main__":
     try:
         main()
-    except getattr(wpc, "UserError", ()) as error:
+    except wpc.UserError as error:
         sys.exit(str(error))
