@@ -453,6 +453,6 @@ def test_what_contradicts_the_run_is_refused(run_dir, name, arguments, sentence)
 def test_a_run_of_td3_bc_is_not_for_the_others(tmp_path):
     line = ["--max-timesteps", 1, "--run-dir", tmp_path]
     run_here(SCRIPTS["td3_bc"], *command("td3_bc", *line))
-    for name, other in (("wpc", "weight"), ("wbc", "alpha")):
+    for name, other in (("wpc", "value_lr"), ("wbc", "alpha")):
         sentence = f"was started with another {other}"
         assert sentence in refusal(SCRIPTS[name], *command(name, *line))
