@@ -397,8 +397,9 @@ def read_dataset(path, state_dim, action_dim, max_action):
         if bad.size:
             raise UserError(
                 f"{path}: {key} is wrong in {bad.size} of {len(column)} rows, first "
-                f"in row {bad[0]}, {column[bad[0]]}: numbers must be finite, terminals "
-                f"and timeouts 0 or 1, actions from {-max_action:g} to {max_action:g}"
+                f"in row {bad[0]} ({column[~good][0]:g}): numbers must be finite, "
+                "terminals and timeouts 0 or 1, and actions from "
+                f"{-max_action:g} to {max_action:g}"
             )
     return arrays
 
