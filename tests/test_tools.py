@@ -10,6 +10,7 @@ all of Pendulum-v1's are cut off.
 import hashlib
 import os
 import re
+import runpy
 import shlex
 import sys
 import warnings
@@ -23,7 +24,7 @@ import minari
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, assert_one_sentence, run, run_here, wpc
+from conftest import DATASET, ROOT, assert_one_sentence, run, run_here, wpc
 from gymnasium.spaces import Box, Dict, Discrete
 from minari.data_collector import EpisodeBuffer
 from PIL import Image
@@ -918,3 +919,21 @@ def test_what_is_no_file_of_td3_bc(tmp_path, float64):
         (ROOT / "wpc.py", "TD3_BC"),
     ):
         assert sentence in refusal_of(check_steps.main, check_steps.Args([path]))
+
+
+TEST_SET = ROOT / "tests/data/minari/test/pendulum-v0"
+
+
+@pytest.mark.parametrize("tool", ["check_physics", "from_minari"])
+def test_what_the_scripts_refuse_is_a_tools_sentence_too(monkeypatch, tmp_path, tool):
+    def refuse(*_):
+        raise wpc.UserError("a sentence")
+
+    monkeypatch.setattr(wpc, "make_envs", refuse)
+    line = {
+        "check_physics": [DATASET, "--env", "halfcheetah"],
+        "from_minari": [TEST_SET, "--env", "ShortPendulum-v0", "--out", tmp_path / "x"],
+    }[tool]
+    monkeypatch.setattr(sys, "argv", [tool, *map(str, line)])
+    with pytest.raises(SystemExit, match="a sentence"):
+        runpy.run_path(str(ROOT / f"tests/tools/{tool}.py"), run_name="__main__")

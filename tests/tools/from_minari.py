@@ -192,4 +192,7 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    try:
+        main(tyro.cli(Args, description=__doc__))
+    except wpc.UserError as error:
+        sys.exit(str(error))
