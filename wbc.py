@@ -41,7 +41,7 @@ import tyro
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm, trange
 
-os.environ.pop("MUJOCO_GL", None)  # training draws nothing, and needs no such library
+os.environ.pop("MUJOCO_GL", None)  # training draws nothing: no OpenGL is needed
 import mujoco
 
 SCRIPT = Path(globals().get("__file__", "notebook"))  # a cell there has no file
@@ -302,7 +302,7 @@ def use_d4rl_physics(env):
 
 def make_envs(env, num_envs):
     """`num_envs` environments for a task, robot or Gymnasium id, stepped together."""
-    warnings.filterwarnings("ignore", ".*(out of date|settotalmass)")  # of -v4
+    warnings.filterwarnings("ignore", ".*(out of date|settotalmass)")  # v4 is meant
     robot = d4rl_robot(env)
     name, wrappers = (robot[0], [use_d4rl_physics]) if robot else (env, None)
     envs = gym.make_vec(name, num_envs, vectorization_mode="sync", wrappers=wrappers)
@@ -505,7 +505,7 @@ def describe_run(args):
     return record | {x.__name__: x.__version__ for x in (torch, gym, mujoco, np)}
 
 
-def resume(path, agent, mean, args):
+def resume(path, agent, mean, std, args):
     """Puts the agent and the random numbers where the checkpoint at `path` has them.
 
     Returns the checkpoint; raises UserError if it is of another run.
@@ -514,9 +514,10 @@ def resume(path, agent, mean, args):
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # of many types where a file is damaged
         raise UserError(f"{path} is damaged: choose another --run-dir") from error
-    # A dataset may move, so its path is not compared, but the mean of its states.
-    began = checkpoint["args"] | {"dataset": checkpoint["mean"].tolist()}
-    now = asdict(args) | {"dataset": mean.tolist()}
+    # A dataset may move, so its path is not compared, but what normalizes its states.
+    old_mean, old_std = checkpoint["mean"], checkpoint["std"]
+    began = checkpoint["args"] | {"dataset": [old_mean.tolist(), old_std.tolist()]}
+    now = asdict(args) | {"dataset": [mean.tolist(), std.tolist()]}
     may_change = {"max_timesteps", "device", "run_dir"}
     for name in began | now:
         if began.get(name) != now.get(name) and name not in may_change:
@@ -573,7 +574,7 @@ def train(args):
     path = run_dir / "checkpoint.pt"
     saved = last_change(path)
     if saved:
-        checkpoint = resume(path, agent, mean, args)
+        checkpoint = resume(path, agent, mean, std, args)
         evaluations = checkpoint["evaluations"]
         first_step = checkpoint["step"] + 1
         if first_step > args.max_timesteps:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Environments of all kinds: D4RL's robots, Gymnasium's, and those of users."""
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -55,6 +57,15 @@ def test_robots_and_tasks_move_in_d4rls_physics_and_other_names_do_not(script):
         assert old != stock and stock == body_masses(env_id)
     for env in ("Hopper-v5", "Ant-v5", "module:Hopper-v4", "module:hopper-v4"):
         assert script.d4rl_robot(env) is None
+
+
+def test_warnings_on_what_is_meant_are_not_shown(script):
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        script.make_envs("hopper", 1)
+        warnings.warn("attribute 'settotalmass' is deprecated", stacklevel=1)
+        warnings.warn("another", stacklevel=1)
+    assert [str(x.message) for x in shown] == ["another"]
 
 
 # Spaces

@@ -384,6 +384,15 @@ def test_a_run_does_not_go_on_with_other_data(run_dir, tmp_path, change):
     assert files(run_dir) == before
 
 
+@pytest.mark.parametrize("name", ["mean", "std"])
+def test_either_of_mean_and_std_tells_other_data(run_dir, name):
+    checkpoint = load(run_dir)
+    checkpoint[name][0] *= 2
+    torch.save(checkpoint, run_dir / "checkpoint.pt")
+    line = command("wpc", "--run-dir", run_dir, "--max-timesteps", 61)
+    assert "was started with another dataset: choose" in refusal(wpc, *line)
+
+
 def test_two_runs_that_start_in_one_folder_at_once(tmp_path, monkeypatch):
     """The second to save finds the other's checkpoint, and leaves all as it is."""
     real_evaluate, line = wpc.evaluate, command("wpc", "--run-dir", tmp_path)
