@@ -42,7 +42,6 @@ MAP = {  # what the paper has, and how the line of wpc.py begins that does it
     "V fits y": "value_loss = F.mse_loss(v, y)",
     "every policy_freq steps": "if step % args.policy_freq == 0:",
     "**w(s, a), eq. 7**": "weight = (advantage > 0).float()  # eq. 7",
-    "w(s, a) of wPC-e, eq. 8": "return (advantage / args.beta).exp().clamp(max=100)",
     "lambda": "lmbda = args.alpha / q_pi.abs().mean().detach()",
     "the policy's objective, eq. 6": "actor_loss = -lmbda * q_pi.mean() + constraint",
     "targets follow": "soft_update(self.critic_target, self.critic, args.tau)",
