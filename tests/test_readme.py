@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 import torch
 import tyro
+from conftest import wpc_with
 from scipy import stats
 
 ROOT = Path(__file__).parents[1]
@@ -168,7 +169,9 @@ def test_its_float32_run_ends_where_it_says():
 
 
 def arguments(script, words):
-    return vars(tyro.cli(importlib.import_module(Path(script).stem).Args, args=words))
+    name, _, weight = Path(script).stem.partition("wpc_")
+    module = wpc_with(weight) if weight else importlib.import_module(name)
+    return vars(tyro.cli(module.Args, args=words))
 
 
 def test_the_runs_have_the_arguments_of_their_commands():
