@@ -73,17 +73,15 @@ def read_rows(columns, env, count):
     if columns.keys() >= set(INFOS):
         states, next_states = np.hstack([columns[name] for name in INFOS]), None
     else:
-        size = state_size(env)
-        states, next_states = (
-            x if x is None else x[:, :size].astype(float)
-            for x in (columns["observations"], columns.get("next_observations"))
-        )
+        states = columns["observations"][:, : state_size(env)]
+        next_states = columns.get("next_observations")
     if next_states is None:
         next_states = np.roll(states, -1, axis=0)
         next_states[terminals | timeouts] = next_states[-1] = np.nan
+    next_states = next_states[:, : states.shape[1]].astype(float)
+    next_states[np.abs(next_states) == 10] = np.nan
     clipped = np.abs(states[:, -env.unwrapped.model.nv :]) == 10
     passed_over = clipped.any(axis=1) | (timeouts & ~terminals)
-    next_states[np.abs(next_states) == 10] = np.nan
     rows = np.linspace(0, len(states) - 1, min(count, len(states))).astype(int)
     kept = rows[~passed_over[rows]]
     if not np.isfinite(next_states[kept]).any():

@@ -54,11 +54,11 @@ def use_era(env, before):
     """Makes `env` move as it did before MuJoCo's release `before`, one of ERAS."""
     model, flags = env.unwrapped.model, mujoco.mjtDisableBit
     changed = [x for x in ERAS if Version(before) <= Version(x) <= INSTALLED]
-    if "3.3" in changed:  # meshes, ellipsoids, cylinders met otherwise
+    if "3.3" in changed:  # the collisions of meshes, ellipsoids, cylinders
         model.opt.disableflags |= flags.mjDSBL_NATIVECCD
-    if "3.5" in changed:  # a contact's larger margin counted, now their sum does
+    if "3.5" in changed:  # a contact's margins are added; the larger one counted
         model.geom_margin /= 2  # exact where all are equal
-    if "3.8" in changed:  # two convex geoms met in one point, now in several
+    if "3.8" in changed:  # two convex geoms meet in several points, not in one
         model.opt.disableflags |= flags.mjDSBL_MULTICCD
     return env
 
