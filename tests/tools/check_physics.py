@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Which simulator is a file's data of? Repeats its transitions in each that we know.
+"""Which MuJoCo is a file's data of? Repeats its transitions as each that we know moves.
 
     python tests/tools/check_physics.py ~/.d4rl/datasets/hopper_medium-v2.hdf5
     python tests/tools/check_physics.py ant.hdf5 --env Ant-v5
 
-Each row's state is set and its action done: in D4RL's physics (for its three robots),
-as before each release of MuJoCo that changed a default (see eras.py), and as installed.
-The state is that of infos/qpos and infos/qvel, where the file has them, and else the
-observation's, which may lack the root's x and y: nothing depends on these. Rows with a
+Each row's state is set and its action done: in D4RL's physics (only its three robots),
+as before each release that changed a default (see eras.py), and as installed. A state
+is taken from infos/qpos and infos/qvel, where the file has them, or else from the
+observation, which may lack the root's x and y: nothing depends on these. Rows with a
 timeout are passed over, and those with a velocity that the observation clips at 10.
 """
 
@@ -37,7 +37,7 @@ class Args:
     file: Annotated[Path, tyro.conf.Positional]
     """HDF5 file in D4RL's format, of a MuJoCo environment"""
     env: str | None = None
-    """Gymnasium id, or halfcheetah, hopper, walker2d; by default that of the name"""
+    """Gymnasium id, or halfcheetah, hopper, walker2d, which the file's name may tell"""
     rows: int = 2_000
     """number of rows, taken evenly from the whole file"""
 
@@ -50,17 +50,14 @@ def read_columns(path):
         return {name: file[name][:] for name in names}
 
 
-def left_out(env):
-    """How many entries of qpos an observation lacks, which goes on with the others and
-    with qvel. Raises UserError if it is made otherwise."""
-    env.reset(seed=0)
-    observation, *_ = env.step(env.action_space.sample())
-    data = env.unwrapped.data
-    state = np.append(data.qpos, data.qvel.clip(-10, 10))
-    for count in range(3):
-        part = observation[: len(state) - count]
-        if part.shape == state[count:].shape and np.allclose(part, state[count:]):
-            return count
+def state_size(env):
+    """How many numbers, first in an observation, are the end of qpos, and all qvel."""
+    observation, _ = env.reset(seed=0)
+    state = np.append(env.unwrapped.data.qpos, env.unwrapped.data.qvel)
+    for lacks in range(3):
+        part = observation[: len(state) - lacks]
+        if part.shape == state[lacks:].shape and np.allclose(part, state[lacks:]):
+            return part.size
     raise wpc.UserError(
         f"{env.spec.id}'s states can't be set: its observations don't begin with qpos "
         f"and qvel, and the file has no {' and '.join(INFOS)}"
@@ -68,32 +65,30 @@ def left_out(env):
 
 
 def read_rows(columns, env, count):
-    """Evenly spaced rows of the columns, `count` or all, and how many of them are passed
-    over. The former are states and next states (N, nq + nv), with NaN for what the file
-    doesn't tell, actions (N, action_dim), rewards and terminals (N,)."""
-    model, total = env.unwrapped.model, len(columns["rewards"])
+    """Evenly spaced rows of the columns, `count` or all, for `repeat`, and how many are
+    passed over. A state is the end of qpos, and qvel; what isn't known of it, NaN."""
     terminals, timeouts = (columns[x].ravel() > 0 for x in ("terminals", "timeouts"))
     if columns.keys() >= set(INFOS):
-        states = np.hstack([columns[name] for name in INFOS])
-        next_states = None
+        states, next_states = np.hstack([columns[name] for name in INFOS]), None
     else:
-        lacks = left_out(env)
-        unknown = np.full((total, lacks), np.nan)
-        end = model.nq + model.nv - lacks
-        states = np.hstack([unknown, columns["observations"][:, :end]])
-        next_states = columns.get("next_observations")
-        if next_states is not None:
-            next_states = np.hstack([unknown, next_states[:, :end]])
+        size = state_size(env)
+        states, next_states = (
+            x if x is None else x[:, :size].astype(float)
+            for x in (columns["observations"], columns.get("next_observations"))
+        )
     if next_states is None:
         next_states = np.roll(states, -1, axis=0)
         next_states[terminals | timeouts] = next_states[-1] = np.nan
+    clipped = np.abs(states[:, -env.unwrapped.model.nv :]) == 10
+    passed_over = clipped.any(axis=1) | (timeouts & ~terminals)
     next_states[np.abs(next_states) == 10] = np.nan
-    passed = (timeouts & ~terminals) | (np.abs(states[:, model.nq :]) == 10).any(axis=1)
-    rows = np.linspace(0, total - 1, min(count, total)).astype(int)
-    kept = rows[~passed[rows]]
-    rewards = columns["rewards"].ravel()
-    columns = states, next_states, columns["actions"], rewards, terminals
-    return [column[kept] for column in columns], len(rows) - len(kept)
+    rows = np.linspace(0, len(states) - 1, min(count, len(states))).astype(int)
+    kept = rows[~passed_over[rows]]
+    if not np.isfinite(next_states[kept]).any():
+        raise wpc.UserError("the file has no transition that can be compared")
+    actions, rewards = columns["actions"], columns["rewards"].ravel()
+    arrays = states, next_states, actions, rewards, terminals
+    return [array[kept] for array in arrays], len(rows) - len(kept)
 
 
 def repeat(env, states, next_states, actions, rewards, terminals):
@@ -105,105 +100,99 @@ def repeat(env, states, next_states, actions, rewards, terminals):
     """
     env.reset(seed=0)
     env = env.unwrapped
-    nq, data, reached, reward_errors, differ = env.model.nq, env.data, [], [], 0
-    for i, state in enumerate(np.nan_to_num(np.float64(states))):
-        data.qpos[:], data.qvel[:] = state[:nq], state[nq:]
+    nq, size, data = env.model.nq, states.shape[1], env.data
+    lacking = np.zeros(nq + env.model.nv - size)
+    reached, reward_errors, differ = [], [], 0
+    for i, state in enumerate(states):
+        data.qpos[:], data.qvel[:] = np.split(np.append(lacking, state), [nq])
         mujoco.mj_forward(env.model, data)
         _, reward, terminated, *_ = env.step(actions[i])
-        reached.append(np.append(data.qpos, data.qvel))
+        reached.append(np.append(data.qpos, data.qvel)[-size:])
         reward_errors.append(abs(reward - rewards[i]))
         differ += terminated != terminals[i]
-    # fmax passes over NaN.
-    errors = np.fmax.reduce(np.abs(np.array(reached) - next_states), axis=1)
+    errors = np.fmax.reduce(np.abs(reached - next_states), axis=1)  # ignores NaN
     largest = np.fmax.reduce(np.abs(next_states), axis=1).clip(1)
-    right = (errors <= 1e-4 * largest)[~np.isnan(errors)]
-    return errors, reward_errors, differ, right.mean() if right.size else 0.0
+    right = (errors <= 1e-4 * largest)[np.isfinite(errors)]
+    return errors, reward_errors, differ, right.sum() / max(right.size, 1)
 
 
-def list_physics(env_id):
-    """Those to try: [words, id for --env or None, environment]."""
+def try_physics(columns, env_id, count):
+    """(name, id for --env or None, what `repeat` returns) of each physics, and how many
+    rows are passed over. Raises UserError if the file isn't the environment's."""
     env_id = re.sub(r"eras:|-before-[\d.]+", "", env_id)
     stock, *_ = wpc.d4rl_robot(env_id) or (env_id,)
-    robot, tried = stock.split("-")[0].lower(), []
+    robot, env = stock.split("-")[0].lower(), wpc.make_envs(stock, 1).envs[0]
+    if not isinstance(getattr(env.unwrapped, "model", None), mujoco.MjModel):
+        raise wpc.UserError(f"{env_id} is none of MuJoCo's environments")
+    shape = columns["observations"].shape
+    if env.observation_space.shape != shape[1:]:
+        raise wpc.UserError(f"the file has observations {shape}: it isn't {env_id}'s")
+    rows, passed_over = read_rows(columns, env, count)
+    physics = []
     if robot in wpc.D4RL_ROBOTS:
-        tried.append(["D4RL's physics", robot, wpc.make_envs(robot, 1).envs[0]])
+        d4rl = wpc.make_envs(robot, 1).envs[0]
+        physics.append(("2.0, as D4RL's", robot, *repeat(d4rl, *rows)))
     for era in eras.ERAS:
         if Version(era) <= eras.INSTALLED:
-            env = eras.use_era(wpc.make_envs(stock, 1).envs[0], era)
             try:
                 name = eras.era_of(stock, f"{era}.dev0")
             except eras.NotHere:
                 name = None
-            tried.append([f"mujoco before {era}", name, env])
-    env = wpc.make_envs(stock, 1).envs[0]
-    return [*tried, [f"mujoco {eras.INSTALLED}, installed", stock, env]]
+            old = eras.use_era(wpc.make_envs(stock, 1).envs[0], era)
+            physics.append((f"before {era}", name, *repeat(old, *rows)))
+    physics.append((f"{eras.INSTALLED}, installed", stock, *repeat(env, *rows)))
+    return physics, passed_over
 
 
-def try_physics(columns, env_id, count):
-    """A row [words, id, errors, reward errors, differ, share] of each physics, the last
-    four as `repeat` returns them, and how many of the file's rows were repeated and
-    passed over. Raises UserError if the file isn't the environment's."""
-    physics = list_physics(env_id)
-    *_, stock = physics[-1]
-    if not isinstance(getattr(stock.unwrapped, "model", None), mujoco.MjModel):
-        raise wpc.UserError(f"{env_id} is no environment of MuJoCo's")
-    shape = columns["observations"].shape
-    if stock.observation_space.shape != shape[1:]:
-        raise wpc.UserError(f"the file has observations {shape}: it isn't {env_id}'s")
-    rows, passed = read_rows(columns, stock, count)
-    results = [[words, name, *repeat(env, *rows)] for words, name, env in physics]
-    return results, len(rows[0]), passed
-
-
-def conclude(results):
-    """The id of the physics that the file is of, or None, and a sentence on it."""
-    best = max(share for *_, share in results)
-    words, names = zip(*((x[0], x[1]) for x in results if x[-1] == best), strict=True)
-    right = f"{100 * best:.4g}% of its next states are right to four digits"
+def conclude(physics):
+    """The id of the physics that repeats the file, or None, and a sentence on it."""
+    best = max(share for *_, share in physics)
+    names, ids = zip(*(x[:2] for x in physics if x[-1] == best), strict=True)
+    which, right = " or ".join(names), f"{100 * best:.4g}% of the next states are right"
     if best < 0.99:
-        return None, f"none of these reproduces the file; in {words[-1]}, {right}"
-    alike = " or ".join(words) + (", which are alike here" if len(words) > 1 else "")
-    return names[-1], f"the file is of {alike}: {right}; evaluate in --env {names[-1]}"
+        return (
+            None,
+            f"The file is of no MuJoCo known here: {right} in the best, {which}",
+        )
+    alike = ", which are alike here" if len(ids) > 1 else ""
+    advice = f"--env {ids[-1]}" if ids[-1] else "register it with eras.use_era"
+    return ids[-1], f"The file is of MuJoCo {which}{alike} ({right}): {advice}"
 
 
 def which_physics(columns, env_id, rows=500):
-    """Which physics data are of: the id for --env that evaluates in it, or None if it is
-    none that we know, and a sentence that says so.
+    """Which MuJoCo data are of: the id for --env that moves as it, None if none does or
+    if that has no id, and a sentence for the user.
 
-    `columns` are a D4RL file's, {name: array (N, ...)}; of next_observations,
-    infos/qpos and infos/qvel what there is. `env_id` is the environment's plain id.
-    Raises UserError with a sentence if its states can't be set.
+    `columns` are a D4RL file's, {name: array (N, ...)}; next_observations, infos/qpos
+    and infos/qvel may be among them. `env_id` is the environment as installed. Raises
+    UserError with a sentence if its states can't be set.
     """
-    results, *_ = try_physics(columns, env_id, rows)
-    return conclude(results)
+    return conclude(try_physics(columns, env_id, rows)[0])
 
 
 def main(args: Args):
     robot = args.file.stem.split("_")[0]
-    env = args.env or (robot if robot in wpc.D4RL_ROBOTS else None)
-    if not env:
-        sys.exit(f"name the environment of {args.file} with --env, as in --env Ant-v5")
+    if not args.env and robot not in wpc.D4RL_ROBOTS:
+        sys.exit(f"whose data has {args.file}? Name it as in --env Ant-v5")
     try:
         columns = read_columns(args.file)
     except (OSError, KeyError) as error:
         sys.exit(f"{args.file}: {error}")
-    results, compared, passed = try_physics(columns, env, args.rows)
+    physics, passed_over = try_physics(columns, args.env or robot, args.rows)
     print(
-        f"{args.file.name}: {compared} rows compared, {passed} passed over; "
-        "median (largest) error:"
+        f"{args.file.name}: {len(physics[0][2])} rows compared, {passed_over} passed "
+        "over; median (largest) error:"
     )
-    print()
-    print("| physics | next state | reward | terminations that differ |")
+    print("\n| MuJoCo | next state | reward | terminations that differ |")
     print("|---|---|---|---|")
-    for words, _, *errors, differ, _ in results:
+    for name, _, *errors, differ, _ in physics:
         cells = [f"{np.nanmedian(x):.2g} ({np.nanmax(x):.2g})" for x in errors]
-        print(f"| {words} | {' | '.join(cells)} | {differ} |")
-    print()
-    print(conclude(results)[1])
+        print(f"| {name} | {' | '.join(cells)} | {differ} |")
+    print(f"\n{conclude(physics)[1]}")
 
 
 if __name__ == "__main__":
     try:
         main(tyro.cli(Args, description=__doc__))
-    except (wpc.UserError, gym.error.Error) as error:
+    except (wpc.UserError, gym.error.Error, ImportError) as error:
         sys.exit(str(error))
