@@ -156,13 +156,14 @@ def d4rl_rows(episode, extra):
         "terminals": episode.terminations,
         "timeouts": np.zeros(steps, dtype=bool),
     }
-    infos = episode.infos or {}
-    for key in {"qpos", "qvel"} & infos.keys():  # for check_physics.py
-        rows[f"infos/{key}"] = infos[key][:steps]
     if extra:
         rows = {k: np.concatenate([x, np.zeros_like(x[:1])]) for k, x in rows.items()}
         rows["observations"][-1] = rows["next_observations"][-1] = states[-1]
         rows["timeouts"][-1] = True
+    for key in ("qpos", "qvel"):  # for check_physics.py
+        values = (episode.infos or {}).get(key, ())
+        if len(values) == steps + 1:
+            rows[f"infos/{key}"] = values[: steps + extra]
     return rows
 
 
@@ -187,11 +188,12 @@ def convert(dataset):
     parts = [
         d4rl_rows(x, not x.terminations[-1] or x is episodes[-1]) for x in episodes
     ]
-    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    keys = [key for key in parts[0] if all(key in part for part in parts)]
+    return {key: np.concatenate([part[key] for part in parts]) for key in keys}
 
 
 def clip(actions, env, allowed):
-    """The actions within the bounds; exits with a sentence if they may not be clipped."""
+    """The actions within the bounds; exits with a sentence if it may not clip them."""
     high = wpc.make_envs(env, 1).single_action_space.high
     beyond = (np.abs(actions) > 1.001 * high).any(axis=1).sum()  # as the scripts count
     if not beyond:
@@ -240,6 +242,8 @@ def choose_era(dataset, env, columns):
         except eras.NotHere as error:
             found[None] = str(error)
     if len(found) != 1:
+        if re.fullmatch(eras.STAYED, env):
+            return env
         try:
             found = dict([which_physics(columns, env)])
         except wpc.UserError as error:
