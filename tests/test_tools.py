@@ -710,7 +710,7 @@ def make_robot(make):
         spaces = gym.make(env)
         return make(
             episode,
-            env=env,
+            env=spaces.spec.id,
             requirements=requirements,
             observation_space=spaces.observation_space,
             action_space=spaces.action_space,
