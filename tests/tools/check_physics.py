@@ -14,6 +14,7 @@ timeout are passed over, and those with a velocity that the observation clips at
 import re
 import sys
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -131,16 +132,16 @@ def try_physics(columns, env_id, count):
     physics = []
     if robot in wpc.D4RL_ROBOTS:
         d4rl = wpc.make_envs(robot, 1).envs[0]
-        physics.append(("2.0, as D4RL's", robot, *repeat(d4rl, *rows)))
-    for era in eras.ERAS:
+        physics.append(("D4RL's, MuJoCo 2.0", robot, *repeat(d4rl, *rows)))
+    for since, era in pairwise(("2.1.2", *eras.ERAS)):
         if Version(era) <= eras.INSTALLED:
             try:
-                name = eras.era_of(stock, f"{era}.dev0")
+                name = eras.era_of(stock, since)
             except eras.NotHere:
                 name = None
             old = eras.use_era(wpc.make_envs(stock, 1).envs[0], era)
-            physics.append((f"before {era}", name, *repeat(old, *rows)))
-    physics.append((f"{eras.INSTALLED}, installed", stock, *repeat(env, *rows)))
+            physics.append((f"mujoco>={since},<{era}", name, *repeat(old, *rows)))
+    physics.append((f"mujoco=={eras.INSTALLED}", stock, *repeat(env, *rows)))
     return physics, passed_over
 
 
@@ -150,13 +151,10 @@ def conclude(physics):
     names, ids = zip(*(x[:2] for x in physics if x[-1] == best), strict=True)
     which, right = " or ".join(names), f"{100 * best:.4g}% of the next states are right"
     if best < 0.99:
-        return (
-            None,
-            f"The file is of no MuJoCo known here: {right} in the best, {which}",
-        )
+        return None, f"The file is none of these: in {which}, the nearest, {right}"
     alike = ", which are alike here" if len(ids) > 1 else ""
     advice = f"--env {ids[-1]}" if ids[-1] else "register it with eras.use_era"
-    return ids[-1], f"The file is of MuJoCo {which}{alike} ({right}): {advice}"
+    return ids[-1], f"The file is of {which}{alike} ({right}): {advice}"
 
 
 def which_physics(columns, env_id, rows=500):
@@ -183,7 +181,7 @@ def main(args: Args):
         f"{args.file.name}: {len(physics[0][2])} rows compared, {passed_over} passed "
         "over; median (largest) error:"
     )
-    print("\n| MuJoCo | next state | reward | terminations that differ |")
+    print("\n| physics | next state | reward | terminations that differ |")
     print("|---|---|---|---|")
     for name, _, *errors, differ, _ in physics:
         cells = [f"{np.nanmedian(x):.2g} ({np.nanmax(x):.2g})" for x in errors]
