@@ -19,7 +19,7 @@ needs_ogbench = pytest.mark.skipif(
     not INSTALLED, reason="OGBench, which requirements.txt leaves out, is not installed"
 )
 STEPS = 20
-SOLVED = [3, 4, 10, STEPS - 1, STEPS, 2 * STEPS]  # rows; one trajectory has STEPS + 1
+SOLVED = [3, 4, 10, STEPS - 1, STEPS, 2 * STEPS]  # rows, of STEPS + 1 a trajectory
 SETS = {  # by the dataset: the environment's id, and what the printed command names
     "antmaze-medium-navigate-singletask-v0": (
         "antmaze-medium-singletask-v0",
@@ -123,7 +123,8 @@ def test_rows_say_where_they_are_from(made):
         assert np.array_equal(
             file["next_observations"][ends], raw["observations"][ends]
         )
-        assert not file["rewards"][ends].any() and not file["terminals"][ends].any()
+        assert not file["terminals"][ends].any()
+        assert file["rewards"][ends].tolist() == [0, -1, -1]  # one is solved there
 
 
 @needs_ogbench

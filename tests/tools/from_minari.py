@@ -29,7 +29,6 @@ import minari
 import numpy as np
 import tyro
 from packaging.requirements import InvalidRequirement, Requirement
-from packaging.version import Version
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -90,8 +89,7 @@ def check_spaces(dataset):
 def as_record(spec, states, actions):
     """What an environment has beside its id, {name: value}."""
     arguments = {k: v for k, v in spec.kwargs.items() if k != "render_mode"}
-    wrappers = [x for x in spec.additional_wrappers or () if x.name != "use_era"]
-    wrappers = [[x.name, x.kwargs] for x in wrappers]
+    wrappers = [[x.name, x.kwargs] for x in spec.additional_wrappers or ()]
     record = {"arguments": arguments, "wrappers": wrappers}
     record = json.loads(json.dumps(record, default=str))  # as Minari stores them
     record |= {"time limit": spec.max_episode_steps, "states": states.shape}
@@ -234,8 +232,7 @@ def choose_era(dataset, env, columns):
     is_mujoco = requirement or hasattr(gym.make(env).unwrapped, "model")
     if not is_mujoco or env.startswith("eras:"):
         return env
-    allowed = list(requirement.specifier.filter(RELEASES)) if requirement else []
-    for version in [x for x in allowed if Version(x) <= eras.INSTALLED] or allowed:
+    for version in requirement.specifier.filter(RELEASES) if requirement else ():
         try:
             name = eras.era_of(env, version)
             found[name] = f"{dataset.id} requires {requirement}: evaluate in {name}"

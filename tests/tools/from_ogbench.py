@@ -82,12 +82,11 @@ def load(args):
 def convert(data):
     """The columns of the file, {key: array}, with T + 1 rows for T transitions."""
     ends = data["valids"] == 0
-    ends[-1] = True
     states = data["observations"]
     columns = {
         "observations": states,
         "actions": data["actions"],
-        "rewards": np.where(ends, 0, data["rewards"]),
+        "rewards": data["rewards"],
         "next_observations": np.where(ends[:, None], states, np.roll(states, -1, 0)),
         "terminals": (data["masks"] == 0) & ~ends,
         "timeouts": ends,
