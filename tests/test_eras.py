@@ -119,14 +119,28 @@ def test_the_environment_of_data(monkeypatch):
     sentence = "we don't know whether Mine-v0 moves .* 3.15.0 as on 3.2.3"
     with pytest.raises(eras.NotHere, match=sentence):
         eras.era_of("mine:Mine-v0", "3.2.3")
-    monkeypatch.setattr(eras, "INSTALLED", Version("3.4.0"))
-    assert eras.era_of("Hopper-v5", "3.2.3") == "Hopper-v5"
-    assert eras.era_of("FetchPush-v4", "3.2.3") == "FetchPush-v4"
+
+
+def test_the_environment_of_data_on_other_releases(monkeypatch):
+    def install(version):
+        monkeypatch.setattr(eras, "INSTALLED", Version(version))
+
+    install("3.3.0")
+    with pytest.raises(eras.NotHere, match="no switch"):
+        eras.era_of("cube-single-v0", "3.2.3")
+    install("3.4.0")
+    for env_id in ("Hopper-v5", "FetchPush-v4"):
+        assert eras.era_of(env_id, "3.2.3") == env_id
+    with pytest.raises(eras.NotHere, match="no switch"):
+        eras.era_of("FrankaKitchen-v1", "3.3.0")
     with pytest.raises(eras.NotHere, match=r"which is newer: .* mujoco==3.15.0$"):
         eras.era_of("Hopper-v5", "3.15.0")
-    monkeypatch.setattr(eras, "INSTALLED", Version("4.0.0"))
+    install("3.5.0")
+    assert eras.era_of("Hopper-v5", "3.4.0") == "eras:Hopper-before-3.5-v5"
+    install("4.0.0")
     with pytest.raises(eras.NotHere, match="no switch"):
         eras.era_of("AntMaze_UMaze-v5", "3.2.3")
+    assert eras.era_of("Hopper-v5", "3.17.0") == "Hopper-v5"
 
 
 # Switches

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT, wpc, write_hdf5
+from packaging.version import Version
 
 sys.path.insert(0, str(ROOT / "tests/tools"))
 sys.path.insert(0, str(ROOT / "tests/data/eras"))
@@ -213,6 +214,7 @@ def test_check_physics_on_transitions_of_our_own(tmp_path, capsys):
     """In D4RL's physics, one of them as if D4RL had clipped it, one wrong."""
     data = own("hopper", range(5))
     data["observations"][0, 8] = 10
+    data["timeouts"] = data["terminals"]  # such rows stay
     rows = len(data["rewards"])
     for key in ("", "next_observations"):
         data.pop(key, None)
@@ -299,6 +301,7 @@ def test_check_physics_on_files_of_other_releases(capsys, tmp_path, env_id):
     _, table, sentence = check(capsys, DATA / f"{env_id}_3.2.3.hdf5", env=env_id)
     old = eras.era_of(env_id, "3.2.3")
     assert table[ERAS[0]][1] < 1e-5 and table[STOCK][1] > 0.1
+    assert table[ERAS[0]][2] < 1e-3  # Ant's reward is of a substep before, so not 1e-6
     assert f"is of {ERAS[0]} or {ERAS[1]}, which are alike here (100% of" in sentence
     assert sentence.endswith(f": --env {old}")
     columns = make.record(env_id, 150, "f4", True)
@@ -317,6 +320,20 @@ def test_a_robot_that_no_release_moved():
     )
     alike = " or ".join([*ERAS, STOCK])
     assert env_id == "Walker2d-v5" and f"is of {alike}, which are alike" in sentence
+
+
+def test_rows_that_are_alike_in_all():
+    """No need then for another name: the pusher's arm hasn't met the object yet."""
+    columns = make.record("Pusher-v5", 10, "f8", True)
+    env_id, sentence = check_physics.which_physics(columns, "Pusher-v5")
+    assert env_id == "Pusher-v5" and "which are alike here (100% of" in sentence
+    assert sentence.endswith(": --env Pusher-v5")
+
+
+def test_releases_after_the_installed_one_are_not_tried(monkeypatch):
+    monkeypatch.setattr(eras, "INSTALLED", Version("3.4.0"))
+    physics, _ = check_physics.try_physics(own("Ant-v5", [0]), "Ant-v5", 10)
+    assert [name for name, *_ in physics] == [ERAS[0], "mujoco==3.4.0"]
 
 
 def test_environments_of_a_users_own(monkeypatch):

@@ -112,7 +112,7 @@ def repeat(env, states, next_states, actions, rewards, terminals):
         reward_errors.append(abs(reward - rewards[i]))
         differ += terminated != terminals[i]
     errors = np.fmax.reduce(np.abs(reached - next_states), axis=1)  # ignores NaN
-    largest = np.fmax.reduce(np.abs(next_states), axis=1).clip(1)
+    largest = np.fmax.reduce(np.abs(next_states), axis=1)
     right = (errors <= 1e-4 * largest)[np.isfinite(errors)]
     return errors, reward_errors, differ, right.sum() / max(right.size, 1)
 
