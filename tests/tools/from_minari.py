@@ -29,6 +29,7 @@ import minari
 import numpy as np
 import tyro
 from packaging.requirements import InvalidRequirement, Requirement
+from packaging.specifiers import SpecifierSet
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -107,9 +108,8 @@ def choose_env(dataset, env, actions):
     spec = dataset._eval_env_spec or dataset.env_spec  # the former has no public name
     if not (env or spec):
         sys.exit(f"{dataset.id} records no environment: name it with --env")
-    package = re.split("[.:]", str(spec.entry_point))[0] if spec else None
-    in_package = "" if package == "gymnasium" else f"{package}:"  # which registers it
-    name = env or in_package + spec.id
+    package = re.split("[.:]", str(spec and spec.entry_point))[0]  # that registers it
+    name = env or (spec.id if package == "gymnasium" else f"{package}:{spec.id}")
     try:
         plain = gym.make(name)
     except Exception as error:  # the environment's own, or from an import
@@ -205,8 +205,8 @@ def clip(actions, env, allowed):
 
 
 def check_requirements(dataset):
-    """Says which requirements of the dataset are not met; returns that of MuJoCo."""
-    of_mujoco = None
+    """Says which requirements are not met; returns those on MuJoCo, a SpecifierSet."""
+    of_mujoco = SpecifierSet()
     for text in np.atleast_1d(dataset.storage.metadata.get("requirements") or []):
         try:
             requirement = Requirement(text)
@@ -217,7 +217,7 @@ def check_requirements(dataset):
             print(f'{dataset.id} requires {text}: pip install "{text}"')
         else:
             if requirement.name == "mujoco":
-                of_mujoco = requirement
+                of_mujoco &= requirement.specifier
             elif not requirement.specifier.contains(installed, prereleases=True):
                 print(f"{dataset.id} requires {text}, and {installed} is installed")
     return of_mujoco
@@ -228,16 +228,18 @@ def choose_era(dataset, env, columns):
 
     The requirements decide, or where they leave it open the transitions.
     """
-    requirement, found = check_requirements(dataset), {}
-    is_mujoco = requirement or hasattr(gym.make(env).unwrapped, "model")
+    allowed, found = check_requirements(dataset), {}
+    is_mujoco = allowed or hasattr(gym.make(env).unwrapped, "model")
     if not is_mujoco or env.startswith("eras:"):
         return env
-    for version in requirement.specifier.filter(RELEASES) if requirement else ():
+    for version in allowed.filter(RELEASES):
         try:
-            name = eras.era_of(env, version)
-            found[name] = f"{dataset.id} requires {requirement}: evaluate in {name}"
+            found[eras.era_of(env, version)] = (
+                f"{dataset.id} requires mujoco{allowed}, and {env} moves otherwise on "
+                f"the installed {eras.INSTALLED}: the command evaluates it as it was"
+            )
         except eras.NotHere as error:
-            found[None] = str(error)
+            found.setdefault(None, str(error))
     if len(found) != 1:
         if re.fullmatch(eras.STAYED, env):
             return env
