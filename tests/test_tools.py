@@ -820,6 +820,13 @@ def test_what_is_not_known_is_said(tmp_path, make_robot, capsys):
     assert env == "Hopper-v5"
 
 
+def test_an_environment_that_eras_does_not_know(tmp_path, make, capsys):
+    name = make(buffer(0, 3), requirements=["mujoco>=3.1,<3.2"])
+    (sentence,), env = output_of(capsys, name, tmp_path / "data.hdf5")
+    assert "know whether Pendulum-v1 moves" in sentence
+    assert sentence.endswith("mujoco==3.1.0") and env == "Pendulum-v1"
+
+
 def test_states_that_can_not_be_set(tmp_path, make_robot, capsys):
     name = make_robot(buffer(0, 3, **shapes(23, 7)), None, "Pusher-v5")
     (sentence,), env = output_of(capsys, name, tmp_path / "data.hdf5")
