@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from make_dataset import reason, try_to_write, write_hdf5
+from make_dataset import reason, try_to_write, write_or_exit
 
 NEEDED = ("observations", "actions", "rewards", "terminals", "timeouts")
 FLAGS = ("terminals", "timeouts")
@@ -103,10 +103,7 @@ def main(args):
     parts, left_out = zip(*map(read, args.files), strict=True)
     check(args.files, parts)
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    try:
-        write_hdf5(args.out, joined)
-    except OSError as error:
-        sys.exit(f"{args.out} can't be written: {error}")
+    write_or_exit(args.out, joined)
     if names := set.union(*left_out):
         print(f"left out, as the scripts don't read them: {', '.join(sorted(names))}")
     terminals, timeouts = joined["terminals"], joined["timeouts"]
