@@ -189,14 +189,6 @@ def test_a_report_by_hand(tool, tmp_path):
     hopper, _ = tables["Differences"]
     assert hopper["wPC - TD3+BC"] == hopper["wPC - wBC"] == expected
 
-    totals = [list(row.values()) for row in tables["Totals"]]
-    assert totals == [  # the paper's on the same two tasks, CORL's, the paper's in all
-        ["wPC", "2", "14.0", "172.5", "-", "800.7"],
-        ["TD3+BC", "2", "28.0", "140.9", "143.1", "712.9"],
-        ["wBC", "2", "28.0", "145.2", "-", "712.7"],
-        ["BC", "1", "4.0", "52.9", "53.5", "475.5"],
-    ]
-
     (row,) = tables["Other weights (Table 2, Figure 4)"]
     assert row["static weight"] == "6.0 (1; 0.12k)" and row["wPC-e, paper"] == "67.0"
     assert row["wPC"] == "2.0 ± 1.0 (3; 0.12k)"
@@ -211,8 +203,7 @@ def test_a_report_by_hand(tool, tmp_path):
     assert row["at step"] == "10 to 30"
     assert row["seeds over 1"] == "3" and row["back"] == "1"
 
-    names = {"figure2", "figure3", "figure4", "runaway"}
-    assert figures(tmp_path / "report") == names
+    assert figures(tmp_path / "report") == {"figure2", "figure3", "figure4"}
 
 
 def test_runs_of_unequal_length(tool, tmp_path):
@@ -320,12 +311,6 @@ def test_q_is_drawn_where_returns_are_negative(tmp_path, monkeypatch):
         draw = [("pendulum", "Q", [curve], [(best, "black", "--")])]
         experiments.draw(tmp_path / "q.png", draw)
     assert scales == ["linear", "linear", "log"]
-    groups = {}
-    for alpha in (1.0, 2.5):
-        key = "pendulum", "wPC", f"alpha {alpha}"
-        values = np.ones((2, 3, 10))
-        groups[key] = experiments.Group(*key, alpha, -0.3, steps, *values)
-    assert experiments.runaway_panels(groups) == []
 
 
 def test_what_is_kept_apart(tool, tmp_path):
@@ -349,7 +334,7 @@ def test_what_is_kept_apart(tool, tmp_path):
         "hopper-medium-expert": ("30.0 (1; 0.12k)", "-"),
         "hopper-medium (mean return)": ("-", "3.0 (1; 0.12k)"),
     }
-    assert figures(tmp_path / "report") == {"figure2", "runaway"}
+    assert figures(tmp_path / "report") == {"figure2"}
     rows = tables["When does Q run away?"]
     assert {(row["arguments"], row["score"]) for row in rows} == {
         ("alpha 2.5", "10.0"),
@@ -374,12 +359,10 @@ def test_the_data_have_a_score_of_their_own(tmp_path, monkeypatch):
     path = tmp_path / "tests/results/datasets.csv"
     path.parent.mkdir(parents=True)
     path.write_text(
-        "task,transitions,mean_score,best_return\nhopper-medium,1000,44.2,10.0\n"
-        "walker2d-medium,2000,9,11.0\n"
+        "task,mean_score,best_return\nhopper-medium,44.2,10.0\nwalker2d-medium,9,11.0\n"
     )
     table = experiments.score_table(groups, ["hopper-medium", "walker2d-medium"], [])
-    rows = ["| hopper-medium | 44.2 | 1,000, of D4RL's policy |"]
-    rows.append("| walker2d-medium | - | - |")
+    rows = ["| hopper-medium | 44.2 |", "| walker2d-medium | - |"]
     assert table.splitlines()[2:] == rows
 
 
@@ -389,7 +372,7 @@ def test_a_report_on_tasks_of_ones_own(tool, tmp_path):
     _, tables = report(tool, tmp_path, tmp_path / "report")
     (row,) = tables["Table 1"]
     assert row["task"] == "mine" and row["BC"] == "10.0 (1; 0.12k)"
-    assert "Totals" not in tables and figures(tmp_path / "report") == set()
+    assert figures(tmp_path / "report") == set()
 
 
 def test_a_report_without_runs(tmp_path):
@@ -407,7 +390,6 @@ def test_other_weights_and_what_is_drawn(tool, tmp_path, monkeypatch):
         "wPC-e": {"weight": "exponential"},
         "wPC-rnd": {"weight": "random"},
         "static weight": {"weight": "static"},
-        "alpha 1.0": {"alpha": 1.0},
     }
     for i, (system, options) in enumerate(systems.items()):
         script = "td3_bc" if system == "TD3+BC" else "wpc"
@@ -416,7 +398,7 @@ def test_other_weights_and_what_is_drawn(tool, tmp_path, monkeypatch):
             make_run(tmp_path / f"{i}/{seed}", *run, q=run[-1] + 0.5, **options)
     _, tables = report(tool, tmp_path, tmp_path / "report")
     (row,) = tables["Other weights (Table 2, Figure 4)"]
-    names = list(systems)[:5]
+    names = list(systems)
     assert [float(row[name].split()[0]) for name in names] == [1, 11, 21, 31, 41]
     (row,) = tables["Differences to other weights"]
     differences = [row[f"wPC - {name}"].split(" [")[0] for name in names[2:]]
@@ -428,8 +410,7 @@ def test_other_weights_and_what_is_drawn(tool, tmp_path, monkeypatch):
         return {name: [x.mean() for x in band] for name, _, _, band in shown}
 
     expected = {name: [10 * i, 10 * i + 1, 10 * i + 2] for i, name in enumerate(names)}
-    assert [panel[0] for panel in drawn["figure2"]] == experiments.TASKS
-    (panel,) = (panel for panel in drawn["figure2"] if panel[2])
+    (panel,) = drawn["figure2"]
     assert panel[0] == "hopper-medium" and curves(panel) == {
         name: expected[name] for name in names[:2]
     }
@@ -441,9 +422,6 @@ def test_other_weights_and_what_is_drawn(tool, tmp_path, monkeypatch):
     (panel,) = drawn["figure5"]
     assert curves(panel) == {name: expected[name] for name in names[:4]}
     assert [level for level, *_ in panel[3]] == [86.5, 57.7, 67.0, 66.5]  # the paper's
-    q, scores = drawn["runaway"]
-    assert curves(q)["alpha 1.0"] == pytest.approx([5.05, 5.15, 5.25])
-    assert curves(scores)["alpha 1.0"] == [50, 51, 52]
 
 
 # --- What is stored -------------------------------------------------------------------
