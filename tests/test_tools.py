@@ -667,6 +667,7 @@ def save_run(folder, env, state_dim, action_dim, max_action=1.0):
         "mean": mean,
         "std": std,
         "max_action": max_action,
+        "evaluations": [{"step": 0}, {"step": 5_000}],
     }
     torch.save(checkpoint, folder / "checkpoint.pt")
     return actor, mean, std
@@ -698,7 +699,7 @@ def hopper_run(tmp_path, monkeypatch):
 
 def test_the_film_is_of_the_run(hopper_run, capsys):
     folder, actor, mean, std = hopper_run
-    play.main(play.Args(folder, folder / "policy.gif", seed=5, size=60))
+    play.main(play.Args([folder], folder / "policy.gif", seed=5, size=60))
     env = wpc.make_envs("hopper", 1).envs[0]
     state, _ = env.reset(seed=5)
     episode_return, steps, over = 0.0, 0, False
@@ -709,29 +710,66 @@ def test_the_film_is_of_the_run(hopper_run, capsys):
         episode_return += reward
         steps, over = steps + 1, terminated or truncated
     score = 100 * (episode_return + 20.272305) / (3234.3 + 20.272305)
-    expected = f"{steps} steps, return {episode_return:.1f}, D4RL's score {score:.1f}"
+    expected = f"{steps} steps, return {episode_return:.0f}; D4RL's score {score:.1f}"
     assert expected in capsys.readouterr().out
     with Image.open(folder / "policy.gif") as film:
-        assert film.size == (60, 60) and film.n_frames == -(-steps // 5)  # 125 fps
+        assert film.size == (60, 60) and film.n_frames == 1 - (-steps // 5)  # 125 fps
         assert film.info["duration"] == 40 and "loop" in film.info
 
 
-def test_frames_as_files(hopper_run):
-    folder = hopper_run[0]
-    play.main(play.Args(folder, folder / "frames", frames=3, size=60))
-    names = sorted(x.name for x in (folder / "frames").iterdir())
-    assert names == ["0000.png", "0001.png", "0002.png"]
-    pictures = [np.array(Image.open(folder / "frames" / name)) for name in names]
-    assert pictures[0].shape == (60, 60, 3) and np.ptp(pictures[0]) > 100
-    assert not np.array_equal(pictures[0], pictures[2])
-    play.main(play.Args(folder, folder / "frames/f%02d.png", frames=1, size=60))
-    assert (folder / "frames/f00.png").exists()
-    play.main(play.Args(folder, folder / "50%/frames", frames=1, size=60))
-    assert (folder / "50%/frames/0000.png").exists()
+def test_what_stands_in_the_picture(hopper_run, monkeypatch):
+    """Also where --frames ends the film before the episode does."""
+    folder, texts = hopper_run[0], []
+
+    def picture(env, size, text, dimmed=False):
+        start = f"{folder.name}\n5,000 training steps, seed 0\n"
+        texts.append((text.removeprefix(start), dimmed))
+
+    monkeypatch.setattr(play, "picture", picture)
+    args = play.Args([folder], folder / "policy.gif", seed=5)
+    images, fps = play.film(folder, args)
+    assert fps == 25 and len(images) == len(texts)
+    assert texts[0] == ("step 0, return 0", False)
+    assert re.fullmatch(r"ended: \d+ steps, return \d+", texts[-1][0])
+    assert [dimmed for _, dimmed in texts] == [False] * (len(texts) - 1) + [True]
+    texts.clear()
+    args.frames = 2
+    assert len(play.film(folder, args)[0]) == 2
+    assert texts[-1][0].startswith("step 5, ")
+
+
+def test_shorter_films_wait_for_the_longest(tmp_path):
+    """Side by side in the given order; the last frame stays for three seconds."""
+    grey = [Image.new("RGB", (8, 8), (x, x, x)) for x in (0, 50, 100, 150, 200)]
+    play.write(tmp_path / "x.gif", [grey[:2], grey[2:]], fps=20)
+    with Image.open(tmp_path / "x.gif") as film:
+        shown = []
+        for i in range(film.n_frames):
+            film.seek(i)
+            picture = film.convert("L")
+            shown.append((picture.getpixel((1, 1)), picture.getpixel((15, 7))))
+            assert film.info["duration"] == (3000 if i == 2 else 50)
+    assert film.size == (16, 8) and shown == [(0, 100), (50, 150), (50, 200)]
+
+
+def test_a_picture_has_its_text_and_is_dimmed():
+    env = SimpleNamespace(render=lambda: np.full((9, 9, 3), 100, np.uint8))
+    bright, dim = play.picture(env, 180, "text"), play.picture(env, 180, "text", True)
+    for image, level in ((bright, 100), (dim, 50)):
+        pixels = np.asarray(image)
+        assert pixels.shape == (180, 180, 3) and (pixels[90:] == level).all()
+        assert pixels[:30].max() > 230
+
+
+def test_runs_of_environments_of_another_speed(tmp_path, monkeypatch):
+    fps = iter((10, 20))
+    monkeypatch.setattr(play, "film", lambda *_: ([], next(fps)))
+    args = play.Args([tmp_path, tmp_path], tmp_path / "x.gif")
+    assert "the same render_fps" in refusal_of(play.main, args)
 
 
 def test_the_camera_follows_the_robot(hopper_run):
-    args = play.Args(hopper_run[0], hopper_run[0], seed=5)
+    args = play.Args([hopper_run[0]], Path("policy.gif"), seed=5)
     env, observation = play.start(args, "hopper")
     assert np.array_equal(observation, gym.make("Hopper-v5").reset(seed=5)[0])
     env.unwrapped.data.qpos[0] += 20
@@ -751,67 +789,41 @@ def test_a_missing_graphics_library(tmp_path):
     assert_one_sentence(process, "MuJoCo needs EGL or OSMesa (on Debian, apt install")
 
 
-def film(tmp_path, monkeypatch, name):
-    """play.py's main with an environment of two steps, whose pictures are grey."""
-
-    class Grey(Delayed):
-        spec = SimpleNamespace(max_episode_steps=3)
-
-        def render(self):
-            return np.full((4, 4, 3), 99, np.uint8)
-
-    save_run(tmp_path, "Grey-v0", 2, 1)
-    observation, _ = (env := Grey()).reset()
-    monkeypatch.setattr(play, "start", lambda *_: (env, observation))
-    play.main(play.Args(tmp_path, tmp_path / name, size=16))
-
-
-def test_an_mp4(tmp_path, monkeypatch):
-    monkeypatch.setattr(play.importlib.util, "find_spec", lambda name: name)
-    films = []
-
-    def write(path, pictures, fps):
-        films.append((path, np.shape(pictures), fps))
-
-    monkeypatch.setattr(play.imageio, "mimsave", write)
-    film(tmp_path, monkeypatch, "policy.mp4")
-    assert films == [(tmp_path / "policy.mp4", (2, 16, 16, 3), 30)]
-
-
 def test_a_full_disk_while_a_film_is_written(tmp_path, monkeypatch):
     def save(*_, **__):
         raise OSError(28, "No space left on device")
 
+    monkeypatch.setattr(play, "film", lambda *_: ([Image.new("RGB", (8, 8))], 30))
     monkeypatch.setattr(Image.Image, "save", save)
-    with pytest.raises(SystemExit, match=r"policy.gif can't be written: \[Errno 28\]"):
-        film(tmp_path, monkeypatch, "policy.gif")
+    args = play.Args([tmp_path], tmp_path / "policy.gif")
+    sentence = refusal_of(play.main, args)
+    assert "policy.gif can't be written: [Errno 28]" in sentence
 
 
-NO_FILM = [
-    ("policy.mov", "must end in .gif, .mp4 or %04d.png, or be a folder"),
-    ("policy.png", "must end in .gif, .mp4 or %04d.png, or be a folder"),
-    ("100%.png", "must end in .gif, .mp4 or %04d.png, or be a folder"),
-    ("policy%d.gif", "must end in .gif, .mp4 or %04d.png, or be a folder"),
-    ("nofolder/policy.gif", "--out can't be written: [Errno 2]"),
-    ("checkpoint.pt/x/%d.png", "--out can't be written: [Errno 20]"),
-    ("policy.mp4", "pip install imageio-ffmpeg"),
-    ("policy.gif", "Unfilmed-v0 can't be filmed ("),
-]
 gym.register("Unfilmed-v0", PENDULUM, max_episode_steps=9, kwargs={"unknown": 1})
 
 
-@pytest.mark.parametrize("out, sentence", NO_FILM)
-def test_films_that_can_not_be_made(tmp_path, monkeypatch, out, sentence):
-    monkeypatch.setattr(play.importlib.util, "find_spec", lambda name: None)
+def test_films_that_can_not_be_made(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
     save_run(tmp_path, "Unfilmed-v0", 3, 1)
-    refusal = refusal_of(play.main, play.Args(tmp_path, tmp_path / out))
-    assert sentence in refusal and "MuJoCo" not in refusal
-    assert [x.name for x in tmp_path.iterdir()] == ["checkpoint.pt"]
+    for out, sentence in (
+        ("nofolder/policy.gif", "--out can't be written: [Errno 2]"),
+        ("policy.gif", "Unfilmed-v0 can't be filmed ("),
+    ):
+        refusal = refusal_of(play.main, play.Args([tmp_path], tmp_path / out))
+        assert sentence in refusal and "MuJoCo" not in refusal
+        assert [x.name for x in tmp_path.iterdir()] == ["checkpoint.pt"]
+    for wrong, sentence in (
+        ({"out": Path("policy.mp4")}, "policy.mp4 must end in .gif"),
+        ({"run_dirs": []}, "name a run"),
+        ({"fps": 0}, "must be >= 1"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            play.Args(**{"run_dirs": [tmp_path], "out": Path("x.gif")} | wrong)
 
 
 def test_films_of_what_is_no_run(tmp_path):
-    args, sentences = play.Args(tmp_path, tmp_path / "policy.gif"), []
+    args, sentences = play.Args([tmp_path], tmp_path / "policy.gif"), []
     sentences.append(refusal_of(play.main, args))
     (tmp_path / "checkpoint.pt").write_bytes(b"nonsense")
     sentences.append(refusal_of(play.main, args))
@@ -903,15 +915,22 @@ def test_what_is_no_file_of_td3_bc(tmp_path, float64):
 TEST_SET = ROOT / "tests/data/minari/test/pendulum-v0"
 
 
-@pytest.mark.parametrize("tool", ["check_physics", "from_minari"])
+@pytest.mark.parametrize(
+    "tool", ["check_physics", "from_minari", "make_dataset", "join"]
+)
 def test_what_the_scripts_refuse_is_a_tools_sentence_too(monkeypatch, tmp_path, tool):
-    def refuse(*_):
+    def refuse(*_, **__):
         raise wpc.UserError("a sentence")
 
     monkeypatch.setattr(wpc, "make_envs", refuse)
+    monkeypatch.setattr(wpc, "read_dataset", refuse)
+    if hasattr(make_dataset.make_env, "cache_clear"):
+        make_dataset.make_env.cache_clear()
     line = {
         "check_physics": [DATASET, "--env", "halfcheetah"],
         "from_minari": [TEST_SET, "--env", "ShortPendulum-v0", "--out", tmp_path / "x"],
+        "make_dataset": ["--env", "hopper", "--steps", 9, "--out", tmp_path / "x"],
+        "join": [DATASET, "--out", tmp_path / "x"],
     }[tool]
     monkeypatch.setattr(sys, "argv", [tool, *map(str, line)])
     with pytest.raises(SystemExit, match="a sentence"):

@@ -246,7 +246,7 @@ def published(source, task):
 
 
 def scores_of_data(groups):
-    """By task, the mean score of the episodes trained on, where datasets.csv has them."""
+    """By task, the mean score of the episodes trained on, if datasets.csv has them."""
     best = {group.task: group.data for group in groups.values() if not group.others}
     with (ROOT / "tests/results/datasets.csv").open() as file:
         rows = list(csv.DictReader(file))

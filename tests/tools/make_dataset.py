@@ -253,6 +253,14 @@ def try_to_write(path):
         path.unlink()
 
 
+def score(env, mean_return):
+    """What D4RL scores a return, as the end of a line; nothing for other robots."""
+    if not (robot := wpc.d4rl_robot(env)):
+        return ""
+    _, low, high = robot
+    return f"; D4RL's score {100 * (mean_return - low) / (high - low):.1f}"
+
+
 def describe(env, data):
     """A line on the episodes of the data, and their SHA-256."""
     ends = np.flatnonzero(data["terminals"] | data["timeouts"]) + 1
@@ -260,9 +268,7 @@ def describe(env, data):
     returns = [x.sum() for x in rewards]
     line = f"{len(ends):,} episodes, return {np.mean(returns):.1f} +- "
     line += f"{np.std(returns):.1f}, largest {np.max(returns):.1f}"
-    if robot := wpc.d4rl_robot(env):
-        _, low, high = robot
-        line += f"; D4RL's score {100 * (np.mean(returns) - low) / (high - low):.1f}"
+    line += score(env, np.mean(returns))
     digest = hashlib.sha256()
     for column in data.values():
         digest.update(column.tobytes())
