@@ -183,10 +183,9 @@ def read_counts(text):
 
 def test_check_physics_on_transitions_of_our_own(tmp_path, capsys):
     """In D4RL's physics, one of them as if D4RL had clipped it, one wrong."""
-    names = ["observations", "actions", "rewards", "next_observations"]
-    names += ["terminals", "timeouts"]
-    columns, _ = make_dataset.play("hopper", None, 0, range(5))
-    data = dict(zip(names, columns, strict=True))
+    env = wpc.make_envs("hopper", 1).envs[0]
+    data = make_dataset.make_columns(100, env)
+    list(make_dataset.collect(make_dataset.Args("hopper", 100, tmp_path), env, data))
     data["observations"][0, 8] = 10
     rows = len(data["rewards"])
     for key in ("", "next_observations"):

@@ -117,44 +117,59 @@ def test_the_policy_gives_the_probabilities_that_d4rl_recorded(robot):
     assert ours[unsaturated] == pytest.approx(theirs[unsaturated], abs=0.01)
 
 
-def test_rows_follow_from_each_other_in_d4rls_physics(tmp_path, policy):
-    play = make_dataset.play
+def rows_of(name, steps, seed=0, policy=None):
+    """The columns of so many steps by a policy, or with uniform actions."""
+    env = wpc.make_envs(name, 1).envs[0]
+    args = make_dataset.Args(name, steps, Path("unused"), seed)
+    data = make_dataset.make_columns(steps, env)
+    assert [n for n, _ in make_dataset.collect(args, env, data, policy)][-1] == steps
+    return data
+
+
+def test_rows_follow_from_each_other_in_d4rls_physics(policy):
     policy = make_dataset.load_policy(policy, 11, 3)
-    columns, episode_return = play("hopper", policy, 7, [3])
-    _, actions, rewards, next_states, terminals, timeouts = columns
-    assert terminals.nonzero()[0] == len(terminals) - 1 and not timeouts.any()
-    assert rewards.sum() == pytest.approx(episode_return)
-    assert np.array_equal(columns[0][1:], next_states[:-1])
-    assert all(x.dtype == np.float32 for x in columns[:4])
-
-    rng = np.random.default_rng([7, 3])
+    data = rows_of("hopper", 60, 7, policy)
+    states, next_states = data["observations"], data["next_observations"]
+    over, k = True, -1
     env = wpc.make_envs("hopper", 1).envs[0]
-    state, _ = env.reset(seed=int(rng.integers(2**31)))
-    assert np.array_equal(columns[0][0], np.float32(state))
-    for i, action in enumerate(actions):
-        mean, std = make_dataset.distribution(policy, columns[0][i])
+    for i in range(60):
+        if over:  # each episode has random numbers of its own
+            k += 1
+            rng = np.random.default_rng([7, k])
+            state, _ = env.reset(seed=int(rng.integers(2**31)))
+        assert np.array_equal(states[i], np.float32(state))
+        mean, std = make_dataset.distribution(policy, states[i])
         drawn = np.tanh(mean + std * rng.standard_normal(3))
-        assert action == pytest.approx(drawn, abs=1e-6)
-        state, reward, *_ = env.step(action)
+        assert data["actions"][i] == pytest.approx(drawn, abs=1e-6)
+        state, reward, over, *_ = env.step(data["actions"][i])
         assert np.array_equal(next_states[i], np.float32(state))
-        assert rewards[i] == np.float32(reward)
+        assert data["rewards"][i] == np.float32(reward)
+        assert data["terminals"][i] == over and not data["timeouts"][i]
+    assert k > 1
 
-    again, _ = play("hopper", policy, 7, [2, 3])  # after another episode
-    assert np.array_equal(again[1][-len(actions) :], actions)
-    other_seed, _ = play("hopper", policy, 8, [3])
-    assert not np.array_equal(other_seed[0][0], columns[0][0])
-    uniform, _ = play("hopper", None, 7, range(20))
-    assert np.histogram(uniform[1], 4, (-1, 1))[0] / uniform[1].size == pytest.approx(
-        [0.25] * 4, abs=0.05
-    )
+    other_seed = rows_of("hopper", 1, 8, policy)
+    assert not np.array_equal(other_seed["observations"][0], states[0])
+    uniform = rows_of("hopper", 500)["actions"]
+    shares = np.histogram(uniform, 4, (-1, 1))[0] / uniform.size
+    assert shares == pytest.approx([0.25] * 4, abs=0.05)
+
+
+def test_the_last_episodes_return():
+    env = wpc.make_envs("hopper", 1).envs[0]
+    args = make_dataset.Args("hopper", 200, Path("unused"))
+    data = make_dataset.make_columns(200, env)
+    returns = [x for _, x in make_dataset.collect(args, env, data)]
+    end, *_ = data["terminals"].nonzero()[0]
+    assert np.isnan(returns[: end + 1]).all()
+    assert returns[end + 1] == pytest.approx(data["rewards"][: end + 1].sum())
 
 
 def test_actions_reach_the_bounds():
     zeros = np.zeros((256, 256)), np.zeros(256)
     w, b = np.zeros((1, 256)), np.full(1, 100.0)
     policy = [(np.zeros((256, 3)), zeros[1]), zeros, (w, b), (w, -b)]
-    columns, _ = make_dataset.play("Pendulum-v1", policy, 0, [0])
-    assert (columns[1] == 2).all() and columns[5].nonzero()[0] == 199
+    data = rows_of("Pendulum-v1", 300, 0, policy)
+    assert (data["actions"] == 2).all() and data["timeouts"].nonzero()[0] == 199
     policy = [*policy[:3], (w, b)]
     mean, std = make_dataset.distribution(policy, np.zeros(3))
     assert mean == 100 and std == pytest.approx(np.exp(2))  # as D4RL's SAC
@@ -212,14 +227,7 @@ def learn(steps, seed=0, random_steps=80):
     """What SAC meets in this environment, and each step's last return."""
     args = make_dataset.Args("Delayed", steps, Path("unused"), seed)
     args.random_steps = random_steps
-    data = {
-        "observations": np.zeros((steps, 2), np.float32),
-        "actions": np.zeros((steps, 1), np.float32),
-        "rewards": np.zeros(steps, np.float32),
-        "next_observations": np.zeros((steps, 2), np.float32),
-        "terminals": np.zeros(steps, bool),
-        "timeouts": np.zeros(steps, bool),
-    }
+    data = make_dataset.make_columns(steps, Delayed)
     returns = [last for _, last in make_dataset.learn(args, Delayed(), data)]
     return data, returns
 
@@ -281,22 +289,29 @@ class Stop:
 def test_ctrl_c_writes_what_sac_met(tmp_path, capsys, monkeypatch):
     path = tmp_path / "made.hdf5"
     args = make_dataset.Args("Pendulum-v1", 1000, path, random_steps=20)
-    make_env = make_dataset.make_env
-    monkeypatch.setattr(make_dataset, "make_env", lambda env: Stop(make_env(env), 30))
+    make_envs = wpc.make_envs
+
+    def stop(*arguments):
+        def make_stopping(name, count):
+            env = make_envs(name, count).envs[0]
+            return SimpleNamespace(envs=[Stop(env, *arguments)])
+
+        monkeypatch.setattr(wpc, "make_envs", make_stopping)
+
+    stop(30)
     make_dataset.main(args)
     data = read(path)
     assert {len(column) for column in data.values()} == {30}
     assert data["timeouts"][-1] and np.abs(data["observations"]).min() > 0
     assert "30 transitions in 1 episodes" in capsys.readouterr().out
 
-    crash = make_env("Pendulum-v1"), 31, ValueError
-    monkeypatch.setattr(make_dataset, "make_env", lambda env: Stop(*crash))
+    stop(31, ValueError)
     with pytest.raises(ValueError):
         make_dataset.main(args)
     assert len(read(path)["rewards"]) == 31
 
     path.unlink()
-    monkeypatch.setattr(make_dataset, "make_env", lambda env: Stop(make_env(env), 0))
+    stop(0)
     assert refusal_of(make_dataset.main, args) == "nothing was collected"
     assert not path.exists()
 
@@ -310,7 +325,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # also where it is ign
 def stopped(*arguments):
     for i, progress in enumerate(collect(*arguments)):
         yield progress
-        if i == 2:
+        if i == 299:
             os.kill(os.getpid(), signal.SIGNAL)
 make_dataset.collect = stopped
 make_dataset.main(make_dataset.Args("hopper", 100000, sys.argv[1], random=True))
@@ -326,10 +341,8 @@ def test_a_signal_writes_what_was_collected(tmp_path, name):
     process = run(sys.executable, "-c", line, cwd=ROOT)
     assert process.returncode == 0 and process.stderr == "", process.stderr
     data = read(path)
-    (columns, _) = make_dataset.play("hopper", None, 0, range(3))
-    for ours, expected in zip(data.values(), columns, strict=True):
-        assert len(ours) == len(expected)
-    assert np.array_equal(data["actions"], columns[1])
+    assert all(len(column) == 300 for column in data.values())
+    assert np.array_equal(data["actions"], rows_of("hopper", 300)["actions"])
 
 
 NO_POLICY = [
@@ -398,7 +411,7 @@ def test_environments_that_the_scripts_can_not_use(tmp_path):
 
 
 def test_out_is_tried_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr(make_dataset, "make_env", None)
+    monkeypatch.setattr(wpc, "make_envs", None)
     monkeypatch.setattr(from_minari, "open_dataset", None)
     out = tmp_path / "nofolder/made.hdf5"
     args = make_dataset.Args("hopper", 10, out, random=True)
@@ -924,8 +937,6 @@ def test_what_the_scripts_refuse_is_a_tools_sentence_too(monkeypatch, tmp_path, 
 
     monkeypatch.setattr(wpc, "make_envs", refuse)
     monkeypatch.setattr(wpc, "read_dataset", refuse)
-    if hasattr(make_dataset.make_env, "cache_clear"):
-        make_dataset.make_env.cache_clear()
     line = {
         "check_physics": [DATASET, "--env", "halfcheetah"],
         "from_minari": [TEST_SET, "--env", "ShortPendulum-v0", "--out", tmp_path / "x"],

@@ -18,7 +18,6 @@ first 1,000 of them random.
 """
 
 import copy
-import functools
 import hashlib
 import io
 import itertools
@@ -68,6 +67,28 @@ class Args:
             raise ValueError("--policy and --random exclude each other")
 
 
+def make_columns(steps, env):
+    """The arrays to fill, by D4RL's names."""
+    states = np.zeros((steps, *env.observation_space.shape), np.float32)
+    return {
+        "observations": states,
+        "actions": np.zeros((steps, *env.action_space.shape), np.float32),
+        "rewards": np.zeros(steps, np.float32),
+        "next_observations": states.copy(),
+        "terminals": np.zeros(steps, bool),
+        "timeouts": np.zeros(steps, bool),
+    }
+
+
+def do_step(env, state, action, data, t):
+    """Writes a step to row t; returns the next state, the reward, and if it is over."""
+    next_state, reward, terminal, truncated, _ = env.step(action)
+    row = (state, action, reward, next_state, terminal, truncated and not terminal)
+    for column, value in zip(data.values(), row, strict=True):
+        column[t] = value
+    return next_state, reward, terminal or truncated
+
+
 # --- Episodes of one policy -----------------------------------------------------------
 
 LAYERS = ("fc0", "fc1", "last_fc", "last_fc_log_std")  # D4RL's names
@@ -106,52 +127,26 @@ def distribution(policy, state):
     return w_mean @ hidden + b_mean, np.exp(np.clip(w_std @ hidden + b_std, -20, 2))
 
 
-make_env = functools.cache(lambda env: wpc.make_envs(env, 1).envs[0])
+def collect(args, env, data, policy=None):
+    """Fills `data`; yields how many rows are filled and the last episode's return.
 
-
-def play(env, policy, seed, numbers):
-    """The rows of the episodes of these numbers, and the return of the last.
-
-    Episode k depends on `seed` and k alone. `policy` is None for uniform actions.
+    Episode k depends on the seed and k alone. Without a policy, actions are uniform.
     """
-    env, rows = make_env(env), []
     low, high = env.action_space.low, env.action_space.high
-    for k in numbers:
-        rng = np.random.default_rng([seed, k])
-        state, _ = env.reset(seed=int(rng.integers(2**31)))
-        over, episode_return = False, 0.0
-        while not over:
-            if policy:
-                mean, std = distribution(policy, np.float32(state))
-                action = high * np.tanh(mean + std * rng.standard_normal(len(std)))
-            else:
-                action = rng.uniform(low, high)
-            action = np.float32(action)
-            next_state, reward, terminal, truncated, _ = env.step(action)
-            timeout = truncated and not terminal
-            rows.append((state, action, reward, next_state, terminal, timeout))
-            state, over = next_state, terminal or truncated
-            episode_return += reward
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    columns = [x.astype("?" if x.dtype == bool else "f4") for x in columns]
-    return columns, episode_return
-
-
-def collect(args, env, data):
-    """Fills `data`; yields how many rows are filled and the last episode's return."""
-    policy, filled = None, 0
-    if args.policy:
-        widths = env.observation_space.shape[0], env.action_space.shape[0]
-        policy = load_policy(args.policy, *widths)
-    for k in itertools.count():
-        columns, episode_return = play(args.env, policy, args.seed, [k])
-        end = min(filled + len(columns[0]), args.steps)
-        for column, new in zip(data.values(), columns, strict=True):
-            column[filled:end] = new[: end - filled]
-        filled = end
-        yield filled, episode_return
-        if filled == args.steps:
-            break
+    episodes, over, episode_return = itertools.count(), True, np.nan
+    for t in range(args.steps):
+        if over:
+            last_return, episode_return = episode_return, 0.0
+            rng = np.random.default_rng([args.seed, next(episodes)])
+            state, _ = env.reset(seed=int(rng.integers(2**31)))
+        if policy:
+            mean, std = distribution(policy, np.float32(state))
+            action = high * np.tanh(mean + std * rng.standard_normal(len(std)))
+        else:
+            action = rng.uniform(low, high)
+        state, reward, over = do_step(env, state, np.float32(action), data, t)
+        episode_return += reward
+        yield t + 1, last_return
 
 
 # --- SAC ------------------------------------------------------------------------------
@@ -195,12 +190,9 @@ def learn(args, env, data):
             with torch.no_grad():
                 action, _ = sample_action(actor, torch.from_numpy(np.float32(state)))
             action = max_action * action.numpy()
-        next_state, reward, terminal, truncated, _ = env.step(action)
-        row = (state, action, reward, next_state, terminal, truncated and not terminal)
-        for column, value in zip(data.values(), row, strict=True):
-            column[t] = value
-        state, episode_return = next_state, episode_return + reward
-        if terminal or truncated:
+        state, reward, over = do_step(env, state, action, data, t)
+        episode_return += reward
+        if over:
             last_return, episode_return = episode_return, 0.0
             state, _ = env.reset()
         yield t + 1, last_return
@@ -308,21 +300,17 @@ def main(args):
     # What a cluster sends before a job's time is over acts as Ctrl-C does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try_to_write(args.out)
-    env = make_env(args.env)  # exits if the scripts can't use it
-    states = np.zeros((args.steps, *env.observation_space.shape), np.float32)
-    data = {
-        "observations": states,
-        "actions": np.zeros((args.steps, *env.action_space.shape), np.float32),
-        "rewards": np.zeros(args.steps, np.float32),
-        "next_observations": states.copy(),
-        "terminals": np.zeros(args.steps, bool),
-        "timeouts": np.zeros(args.steps, bool),
-    }
-    fill = collect if args.policy or args.random else learn
+    env = wpc.make_envs(args.env, 1).envs[0]
+    data = make_columns(args.steps, env)
+    if args.policy:
+        sizes = env.observation_space.shape[0], env.action_space.shape[0]
+        fill = collect(args, env, data, load_policy(args.policy, *sizes))
+    else:
+        fill = collect(args, env, data) if args.random else learn(args, env, data)
     filled = 0
     try:
         with tqdm(total=args.steps, disable=None) as progress:
-            for filled, episode_return in fill(args, env, data):
+            for filled, episode_return in fill:
                 progress.set_postfix_str(f"return {episode_return:.0f}", refresh=False)
                 progress.update(filled - progress.n)
     except KeyboardInterrupt:
