@@ -46,8 +46,6 @@ from compiled import TraceableAdam
 
 import wpc
 
-CYCLE = 10  # steps in a CUDA graph
-
 
 @dataclass
 class Options:
@@ -159,7 +157,7 @@ class Runs:
 
     def __init__(self, runs, dims, data, device):
         self.runs, self.data, self.device = runs, data, device
-        self.metrics, self.graph = {}, None
+        self.metrics = {}
         agents = []
         for args in runs:
             torch.manual_seed(args.seed)
@@ -236,28 +234,20 @@ class Runs:
         with torch.enable_grad():
             graph = make_fx(lambda *_: self.two_steps())(*state)
         self.inputs = [tensor.detach() for tensor in state]  # the same memory
-        self.metrics = dict.fromkeys(self.metrics)
         with torch.no_grad():
             self.compiled = compiler(graph, self.inputs)
 
     @torch.no_grad()
-    def do(self, steps):
-        for _ in range(steps // 2):
-            values = self.compiled(*self.inputs)
+    def two_compiled_steps(self):
+        values = self.compiled(*self.inputs)
         self.metrics = dict(zip(self.metrics, values, strict=True))
 
-    def cycle(self):
-        """Does CYCLE steps."""
-        if self.graph is None:
-            self.do(CYCLE)
-        else:
-            self.graph.replay()
-
     def capture(self):
-        """From here on, a cycle is a CUDA graph."""
-        self.graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self.graph):
-            self.do(CYCLE)
+        """Makes two compiled steps a CUDA graph, without doing them."""
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self.two_compiled_steps()
+        self.two_compiled_steps = graph.replay
 
     def snapshot(self):
         """Of each run: what to evaluate, its checkpoint, and its row but for scores."""
@@ -355,11 +345,8 @@ def read_commands(path):
         for name, value in asdict(args).items():
             if shared.setdefault(name, value) != value and name not in MAY_DIFFER:
                 sys.exit(f"{path}: all runs must have the same {name}")
-    if not runs or runs[0].policy_freq != 2 or runs[0].eval_freq % CYCLE:
-        sys.exit(
-            f"{path} must have runs with policy_freq 2 and an eval_freq that {CYCLE} "
-            "divides"
-        )
+    if not runs or runs[0].policy_freq != 2 or runs[0].eval_freq % 2:
+        sys.exit(f"{path} must have runs with policy_freq 2 and an even eval_freq")
     if runs[0].max_timesteps % runs[0].eval_freq:
         sys.exit(f"{path}: eval_freq must divide max_timesteps")
     return runs
@@ -393,16 +380,15 @@ def train(runs, evaluations, compiler=None):
     args, begin = runs.runs[0], time.perf_counter()
     evaluations.begin(0, 0.0)
     runs.compile(compiler or (lambda graph, inputs: graph))
-    runs.do(CYCLE - 2)
+    step = 2
     evaluations.end()  # a broken environment is found early
-    if compiler:
-        runs.capture()
-    step = CYCLE
     for evaluation in range(args.eval_freq, args.max_timesteps + 1, args.eval_freq):
         clock, first = time.perf_counter(), step
         while step < evaluation:
-            runs.cycle()
-            step += CYCLE
+            runs.two_compiled_steps()
+            step += 2
+            if step == 10 and compiler:
+                runs.capture()
         if compiler:
             torch.cuda.synchronize()
         speed = (step - first) / (time.perf_counter() - clock)
