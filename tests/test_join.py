@@ -85,6 +85,8 @@ def test_a_terminal_last_row_stays_terminal(tmp_path):
     extra = joined[len(first)]
     last = columns(0)["observations"][-1]
     assert extra[:11] == pytest.approx(last, abs=1e-5) and extra[-1] == 1
+    with h5py.File(tmp_path / "joined.hdf5") as file:
+        assert not file["timeouts"][19]  # with which d4rl would drop it
     kept = np.delete(joined, len(first), axis=0)
     assert kept == pytest.approx(np.concatenate([first, second]), abs=1e-5)
 

@@ -154,6 +154,18 @@ def test_rows_follow_from_each_other_in_d4rls_physics(policy):
     assert shares == pytest.approx([0.25] * 4, abs=0.05)
 
 
+def test_an_end_by_both_is_no_timeout():
+    for terminal, truncated in ((True, True), (False, True), (True, False)):
+        results = np.ones(2), 0.5, terminal, truncated, {}
+        env = SimpleNamespace(step=lambda action, results=results: results)
+        data = make_dataset.make_columns(2, Delayed)
+        _, reward, over = make_dataset.do_step(env, np.zeros(2), np.zeros(1), data, 1)
+        assert reward == 0.5 and over
+        assert data["terminals"].tolist() == [False, terminal]
+        assert data["timeouts"].tolist() == [False, not terminal]
+        assert data["next_observations"].tolist() == [[0, 0], [1, 1]]
+
+
 def test_the_last_episodes_return():
     env = wpc.make_envs("hopper", 1).envs[0]
     args = make_dataset.Args("hopper", 200, Path("unused"))

@@ -136,6 +136,10 @@ class Group:
     def size(self):
         return f"{len(self.scores)}; {self.steps[-1] / 1000:,g}k"
 
+    @property
+    def score(self):
+        return f"{mean_and_std(self.last_ten())} ({self.size})"
+
 
 def read_run(folder):
     """What the report needs of a run; a ValueError says why it is of no use."""
@@ -264,8 +268,7 @@ def score_table(groups, tasks, systems):
         row = [task, data.get(task, "-")]
         for name in header[2:]:
             group = groups.get((task, name, ""))
-            ours = f"{mean_and_std(group.last_ten())} ({group.size})" if group else "-"
-            row.append(published(name, task) if name in PUBLISHED else ours)
+            row.append(group.score if group else published(name, task))
         rows.append(row)
     return markdown(header, rows)
 
