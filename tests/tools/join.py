@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from make_dataset import reason, try_to_write, write_hdf5
+from make_dataset import reason, try_to_write, write_or_exit
 
 import wpc
 
@@ -80,10 +80,7 @@ def main(args):
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     for name in ("rewards", "terminals", "timeouts"):
         joined[name] = joined[name].ravel()  # as D4RL's files have them
-    try:
-        write_hdf5(args.out, joined)
-    except OSError as error:
-        sys.exit(f"{args.out} can't be written: {error}")
+    write_or_exit(args.out, joined)
     terminals, timeouts = joined["terminals"], joined["timeouts"]
     transitions = np.count_nonzero((terminals | ~timeouts)[:-1])
     print(

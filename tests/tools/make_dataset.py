@@ -280,6 +280,21 @@ def write_hdf5(path, columns):
         raise
 
 
+def write_or_exit(path, columns):
+    """Writes arrays by name to an HDF5 file, or exits with the system's reason."""
+    try:
+        write_hdf5(path, columns)
+    except OSError as error:
+        sys.exit(f"--out {path} can't be written: {error}")
+
+
+def print_command(env, out):
+    """Prints the command that trains on the file, from the repository's folder."""
+    command = [sys.orig_argv[0], "wpc.py", "--env", env, "--dataset", str(out)]
+    path = "PYTHONPATH=tests/tools " if env.startswith("eras:") else ""
+    print(f"to train: {path}{shlex.join(command)}")
+
+
 def write(args, data):
     """Writes the file, and prints what is in it and the command that trains on it."""
     data["timeouts"][-1] = not data["terminals"][-1]  # the last episode is cut off
@@ -292,8 +307,7 @@ def write(args, data):
         write_hdf5(out, data)
     rows = len(data["timeouts"])
     print(f"{out}: {rows:,} transitions in {describe(args.env, data)}")
-    command = [sys.orig_argv[0], "wpc.py", "--env", args.env, "--dataset", str(out)]
-    print(f"to train: {shlex.join(command)}")
+    print_command(args.env, out)
 
 
 def main(args):
