@@ -2,7 +2,8 @@
 """Trains many runs at once on one GPU, with evaluation on the CPU's cores.
 
     python tests/tools/experiments.py list table1 --runs runs/paper > commands.txt
-    python tests/tools/together.py commands.txt
+    grep hopper commands.txt > hopper.txt
+    python tests/tools/together.py hopper.txt
 
 A step of one run leaves a GPU idle nearly all of the time. Here all R runs become one:
 a network's parameters are (R, P), a batch is (R, B, width), and each step is `update`
@@ -12,7 +13,8 @@ The step is traced, compiled by torch.compile and captured as a CUDA graph.
 
 Networks start as the script starts them with the run's seed. Batches and noise are
 drawn for all runs together, so a run is not the one that the script makes with the same
-seed, but one as likely. The runs must be of one robot. Each leaves args.json and
+seed, but one as likely. The runs must be of one robot. If you edit wpc.py, let `update`
+combine the rows of a batch by means alone. Each run leaves args.json and
 evaluations.csv, as its script does, and a checkpoint.pt with its policy, for play.py;
 it can't be continued.
 """
@@ -370,7 +372,7 @@ def load(runs, device):
         options = wpc.Args(args.env, path, discount=args.discount, device="cpu")
         datasets[key] = wpc.prepare_dataset(wpc.read_dataset(path, *dims), options)
     if len(sizes) > 1:
-        sys.exit("the runs must be of one robot: make a file of each robot's commands")
+        sys.exit("the runs must be of one robot: make a file for each robot's commands")
     data = [datasets[args.env, args.dataset] for args in runs]
     return Runs(runs, dims, data, device)
 
