@@ -122,7 +122,7 @@ def film(run_dir, args):
     checkpoint, policy = load(run_dir)
     name, seed = checkpoint["args"]["env"], checkpoint["args"]["seed"]
     trained = checkpoint["evaluations"][-1]["step"]
-    title = f"{run_dir.name}\n{trained:,} training steps, seed {seed}\n"
+    title = f"{run_dir.resolve().name}\n{trained:,} training steps, seed {seed}\n"
     env, observation = start(args, name)
     fps = env.metadata.get("render_fps", 30)
     every = math.ceil(fps / args.fps)
