@@ -9,11 +9,9 @@ All episodes begin with the same seed. Above each stands the name of its folder.
 import math
 import os
 import sys
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import torch
 import tyro
@@ -71,16 +69,15 @@ def load(run_dir):
     return checkpoint, policy
 
 
-def make_env(env):
+def make_env(name):
     """The environment that the scripts evaluate on, with pictures."""
-    warnings.filterwarnings("ignore", ".*out of date")
-    robot = wpc.d4rl_robot(env)
-    env = gym.make(robot[0] if robot else env, render_mode="rgb_array")
+    env = wpc.make_envs(name, 1).envs[0]
+    env.unwrapped.render_mode = "rgb_array"
     renderer = getattr(env.unwrapped, "mujoco_renderer", None)
     if renderer:  # the camera that follows the robot, or -1, which stands still
         camera = mujoco.mjtObj.mjOBJ_CAMERA
         renderer.camera_id = mujoco.mj_name2id(env.unwrapped.model, camera, "track")
-    return wpc.use_d4rl_physics(env) if robot else env
+    return env
 
 
 def start(args, name):
