@@ -215,8 +215,7 @@ def test_runs_of_unequal_length(tool, tmp_path):
         steps = (shorter, longer)[seed]
         path = tmp_path / f"td3_bc{seed}"
         make_run(path, "td3_bc", "hopper_medium", seed, seed, steps=steps)
-    out, tables = report(tool, tmp_path, tmp_path / "report")
-    assert "('hopper-medium', 'TD3+BC', '') counts to step 100, not to 200" in out
+    _, tables = report(tool, tmp_path, tmp_path / "report")
     (row,) = with_runs(tables["Table 1"])
     # Steps 155, 160, ..., 200; seed 1 scores one more
     assert row["wPC"] == "178.0 ± 0.7 (2; 0.2k)"
@@ -281,7 +280,8 @@ def test_runs_on_different_data_are_no_seeds_of_one_system(tool, tmp_path):
     printed, tables = report(tool, tmp_path, tmp_path / "report")
     (row,) = with_runs(tables["Table 1"])
     assert row["wPC"] == "10.0 ± 0.0 (2; 0.12k)" and row["wBC"] == "-"
-    assert "'wBC', '') (different data, with best returns 10.0 and 11.0)" in printed
+    assert "'wBC', '') (its runs share 12 evaluations, on data with" in printed
+    assert "best returns of 10.0 and 11.0)" in printed
 
 
 def test_systems_on_different_data_are_not_compared(tmp_path):

@@ -211,16 +211,13 @@ def read_groups(folder):
         runs = [seeds[seed] for seed in sorted(seeds)]
         data = {f"{run['best_discounted_return'][-1]:.1f}" for run in runs}
         steps = functools.reduce(np.intersect1d, [run["step"] for run in runs])
-        if len(data) > 1:
+        if len(data) > 1 or len(steps) < 10:
             best = " and ".join(sorted(data))
-            print(f"passed over: {key} (different data, with best returns {best})")
+            print(
+                f"passed over: {key} (its runs share {len(steps)} evaluations, on data "
+                f"with best returns of {best})"
+            )
             continue
-        if len(steps) < 10:
-            print(f"passed over: {key} (its runs share {len(steps)} evaluations)")
-            continue
-        longest = max(run["step"][-1] for run in runs)
-        if longest > steps[-1]:
-            print(f"{key} counts to step {steps[-1]:,.0f}, not to {longest:,.0f}")
         scores, q = (
             np.stack([run[name][np.isin(run["step"], steps)] for run in runs])
             for name in ("score", "q")
