@@ -19,7 +19,6 @@ import io
 import json
 import os
 import re
-import shlex
 import sys
 import time
 import warnings
@@ -96,18 +95,13 @@ class Args:
         if self.run_dir is None:
             name = f"{Path(self.dataset or self.env).stem}__{SCRIPT.stem}__{self.seed}"
             self.run_dir = f"runs/{name}__{datetime.now():%Y-%m-%d_%H-%M-%S.%f}"
-        counts = [self.max_timesteps, self.eval_freq, self.eval_episodes]
-        counts += [self.batch_size, self.policy_freq]
-        if min(counts) < 1:
+        counts = self.max_timesteps, self.eval_freq, self.eval_episodes
+        if min(*counts, self.batch_size, self.policy_freq) < 1:
             raise ValueError("steps, frequencies, episodes and batch_size must be >= 1")
         if not (0 <= self.discount <= 1 and 0 <= self.tau <= 1):
             raise ValueError("discount and tau must be between 0 and 1")
-        known = self.env in D4RL_ROBOTS or not d4rl_robot(self.env)
-        if not (D4RL_TASK.fullmatch(self.env) or (self.dataset and known)):
-            raise ValueError(
-                f"--env {self.env} must be a task of D4RL's, {D4RL_TASK.pattern}, or "
-                "with --dataset one of these robots or a Gymnasium id"
-            )
+        if not (self.dataset or D4RL_TASK.fullmatch(self.env)):
+            raise ValueError(f"without --dataset, --env must be {D4RL_TASK.pattern}")
 
 
 # --- Networks -------------------------------------------------------------------------
@@ -180,7 +174,6 @@ class Agent:
         args, max_action = self.args, self.actor.max_action
         s, a, r = batch["observations"], batch["actions"], batch["rewards"]
         s_next, done = batch["next_observations"], batch["terminals"]
-        assert r.shape == done.shape == (*a.shape[:-1], 1), "must be (B, 1)"
 
         # Target: the smaller of the two target Q-values, at a noisy next action
         with torch.no_grad():
@@ -194,6 +187,7 @@ class Agent:
         # Critics: Q1 and Q2 fit the target
         q1, q2 = self.critic(s, a)
         critic_loss = F.mse_loss(q1, y) + F.mse_loss(q2, y)
+        assert y.shape == q1.shape, "rewards and terminals must be (B, 1)"
         self.critic_optimizer.zero_grad()
         critic_loss.backward()
         self.critic_optimizer.step()
@@ -247,7 +241,8 @@ D4RL_TASK = re.compile(
 
 def d4rl_robot(env):
     """The entry of D4RL_ROBOTS for hopper or hopper-medium-v2; None for Hopper-v4."""
-    return D4RL_ROBOTS.get(env.split("-")[0])
+    task = D4RL_TASK.fullmatch(env)
+    return D4RL_ROBOTS.get(task[1] if task else env)
 
 
 def use_d4rl_physics(env):
@@ -289,7 +284,6 @@ def make_envs(env, num_envs):
     if not (
         type(states) is type(actions) is gym.spaces.Box
         and len(states.shape) == len(actions.shape) == 1
-        and actions.is_bounded()
         and np.ptp([-actions.low, actions.high]) == 0  # all bounds are -x or x
         and time_limit
     ):
@@ -336,17 +330,18 @@ def download_dataset(task):
     """Path of a task's D4RL file, downloaded unless it is in d4rl's folder."""
     name = task.removesuffix("-v2").replace("-", "_") + "-v2.hdf5"
     folder = os.environ.get("D4RL_DATASET_DIR", "~/.d4rl/datasets")
-    path = Path(os.path.expanduser(folder), name)
+    path = Path(folder, name).expanduser()
     for server in D4RL_SERVERS:
         if path.exists():  # perhaps by now, as another process downloads it too
             break
         try:
             print("downloading from", server)
+            content = urlopen(server + name, timeout=60).read()
+            h5py.File(io.BytesIO(content)).close()  # fails if it is a login page, say
             os.makedirs(path.parent, exist_ok=True)
             with TemporaryDirectory(dir=path.parent) as own:
                 part = Path(own, name)
-                part.write_bytes(urlopen(server + name, timeout=60).read())
-                h5py.File(part).close()  # fails if it is a login page, say
+                part.write_bytes(content)
                 os.replace(part, path)
         except (OSError, HTTPException) as error:
             print(error)
@@ -369,24 +364,19 @@ def read_dataset(path, state_dim, action_dim, max_action):
     try:
         with h5py.File(path) as file:
             for key in widths:
-                if isinstance(file.get(key), h5py.Group):
-                    raise TypeError(f"{key} is a group of {', '.join(file[key])}")
-                if key in file:
+                if key in file or key != "next_observations":
                     column = np.float32(file[key][:])
                     arrays[key] = column[:, None] if column.ndim == 1 else column
     except Exception as error:  # h5py raises nearly any type where a file is damaged
-        raise UserError(f"{path} can't be read: {error}") from error
-    missing = widths.keys() - arrays.keys() - {"next_observations"}
-    if missing:
         raise UserError(
-            f"{path} has no {' and no '.join(sorted(missing))}, which D4RL's format "
-            "needs (timeouts: 1 where an episode was cut off, else 0)"
-        )
+            f"{path} can't be read: {error}; D4RL's format has arrays of observations, "
+            "actions, rewards, terminals and timeouts (1 where an episode was cut off)"
+        ) from error
     for key, column in arrays.items():
         if column.shape != (len(arrays["rewards"]), widths[key]):
             raise UserError(
-                f"{path}: {key} must have shape (N, {widths[key]}), with N the same "
-                f"for all, and has {column.shape} (MATLAB's have their axes reversed)"
+                f"{path}: {key} has shape {column.shape}, not (N, {widths[key]}) with "
+                "the same N for all; MATLAB reverses the axes"
             )
         good = np.isfinite(column)
         if key in ("terminals", "timeouts"):
@@ -396,10 +386,9 @@ def read_dataset(path, state_dim, action_dim, max_action):
         bad = np.flatnonzero(~good.all(axis=1))
         if bad.size:
             raise UserError(
-                f"{path}: {key} is wrong in {bad.size} of {len(column)} rows, first "
-                f"in row {bad[0]} ({column[~good][0]:g}): numbers must be finite, "
-                "terminals and timeouts 0 or 1, and actions from "
-                f"{-max_action:g} to {max_action:g}"
+                f"{path}: {key} is wrong in {bad.size} row(s), first in row {bad[0]} "
+                f"({column[~good][0]:g}): numbers must be finite, terminals and "
+                f"timeouts 0 or 1, and actions from {-max_action:g} to {max_action:g}"
             )
     return arrays
 
@@ -471,59 +460,58 @@ def save(run_dir, checkpoint, record):
     write_file(run_dir / "args.json", json.dumps(record, indent=2).encode())
 
 
-def last_change(path):
-    """When a file was last written, in nanoseconds; None if it is not there."""
-    return path.stat().st_mtime_ns if path.exists() else None
-
-
-def describe_run(args):
-    """What args.json holds: the arguments, the script's digest, and versions."""
-    script = SCRIPT.read_bytes() if SCRIPT.exists() else b""
-    record = asdict(args) | {"script_sha256": hashlib.sha256(script).hexdigest()}
-    return record | {x.__name__: x.__version__ for x in (torch, gym, mujoco, np)}
-
-
-def resume(path, agent, mean, std, args):
+def resume(path, agent, identity):
     """Puts the agent and the random numbers where the checkpoint at `path` has them.
 
-    Returns the checkpoint; raises UserError if it is of another run.
+    Returns the checkpoint; raises UserError if it is of a run of another identity.
     """
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # of many types where a file is damaged
         raise UserError(f"{path} is damaged: choose another --run-dir") from error
-    # A dataset may move, so its path is not compared, but what normalizes its states.
-    old_mean, old_std = checkpoint["mean"], checkpoint["std"]
-    began = checkpoint["args"] | {"dataset": [old_mean.tolist(), old_std.tolist()]}
-    now = asdict(args) | {"dataset": [mean.tolist(), std.tolist()]}
-    may_change = {"max_timesteps", "device", "run_dir"}
-    for name in began | now:
-        if began.get(name) != now.get(name) and name not in may_change:
-            raise UserError(
-                f"{path.parent} was started with another {name}: choose another "
-                "--run-dir"
-            )
+    began = checkpoint["identity"]
+    for name in identity | began:
+        if identity.get(name) != began.get(name):
+            raise UserError(f"{path} has another {name}: choose another --run-dir")
     for name, state in checkpoint["agent"].items():
         getattr(agent, name).load_state_dict(state)
-    torch.manual_seed(args.seed + checkpoint["step"])  # a GPU draws new numbers
+    torch.manual_seed(identity["seed"] + checkpoint["step"])  # a GPU draws new numbers
     torch.set_rng_state(checkpoint["rng_state"])  # a CPU goes on with the old ones
     return checkpoint
 
 
-def check_device(device):
+def last_change(path):
+    """When a file was last written, in nanoseconds; None if it is not there."""
+    return path.stat().st_mtime_ns if path.exists() else None
+
+
+def set_up(args):
+    """The environments, the agent, and what `prepare_dataset` returns."""
+    torch.set_flush_denormal(True)  # a CPU takes far longer for numbers below 1e-38
     try:
-        torch.zeros(1, device=device)
+        torch.zeros(1, device=args.device)
     except (RuntimeError, AssertionError) as error:
-        raise UserError(f"no --device {device} here; cpu works") from error
+        raise UserError(f"no --device {args.device} here; cpu works") from error
+    envs = make_envs(args.env, args.eval_episodes)
+    state_dim = envs.single_observation_space.shape[0]
+    action_dim = envs.single_action_space.shape[0]
+    max_action = float(envs.single_action_space.high[0])
 
-
-def print_facts(path, dataset, max_action, args):
+    path = args.dataset or download_dataset(args.env)
+    arrays = read_dataset(path, state_dim, action_dim, max_action)
+    dataset, *others = prepare_dataset(arrays, args)
     print(
         f"{path} has {len(dataset['rewards']):,} transitions, "
-        f"{dataset['terminals'].sum():,.0f} of them terminal, with actions up to "
+        f"{dataset['terminals'].sum():.0f} of them terminal, with actions up to "
         f"{dataset['actions'].abs().max():.4g} where --env {args.env} allows "
         f"{max_action:g}; alpha is {args.alpha:g}"
     )
+
+    torch.manual_seed(args.seed)
+    agent = Agent(state_dim, action_dim, max_action, args)
+    # The other scripts build other networks: seeding again makes the batches equal.
+    torch.manual_seed(args.seed)
+    return envs, agent, dataset, *others
 
 
 def train(args):
@@ -531,35 +519,26 @@ def train(args):
 
     Returns its evaluations, the rows of evaluations.csv as dictionaries.
     """
-    torch.set_flush_denormal(True)  # a CPU takes far longer for numbers below 1e-38
-    check_device(args.device)
-    envs = make_envs(args.env, args.eval_episodes)
-    state_dim = envs.single_observation_space.shape[0]
-    action_dim = envs.single_action_space.shape[0]
-    max_action = float(envs.single_action_space.high[0])
-
-    dataset_path = args.dataset or download_dataset(args.env)
-    arrays = read_dataset(dataset_path, state_dim, action_dim, max_action)
-    dataset, mean, std, best_return = prepare_dataset(arrays, args)
-    print_facts(dataset_path, dataset, max_action, args)
-
-    torch.manual_seed(args.seed)
-    agent = Agent(state_dim, action_dim, max_action, args)
-    # The other scripts build other networks: seeding again makes the batches equal.
-    torch.manual_seed(args.seed)
+    envs, agent, dataset, mean, std, best_return = set_up(args)
+    # A run may go on elsewhere, or longer, but not with other arguments or other data.
+    identity = asdict(args) | {"dataset": [mean.tolist(), std.tolist()]}
+    for name in ("max_timesteps", "device", "run_dir"):
+        del identity[name]
 
     run_dir, first_step, metrics, evaluations = Path(args.run_dir), 0, {}, []
     path = run_dir / "checkpoint.pt"
     saved = last_change(path)
     if saved:
-        checkpoint = resume(path, agent, mean, std, args)
+        checkpoint = resume(path, agent, identity)
         evaluations = checkpoint["evaluations"]
         first_step = checkpoint["step"] + 1
         if first_step > args.max_timesteps:
             print(f"{run_dir} is finished; raise --max-timesteps to train longer")
 
     os.makedirs(run_dir, exist_ok=True)
-    record = describe_run(args)
+    script = SCRIPT.read_bytes() if SCRIPT.exists() else b""
+    record = asdict(args) | {"script_sha256": hashlib.sha256(script).hexdigest()}
+    record |= {x.__name__: x.__version__ for x in (torch, gym, mujoco, np)}
     writer = SummaryWriter(run_dir, purge_step=first_step)
     clock = time.perf_counter()
     clock_step = first_step
@@ -570,9 +549,9 @@ def train(args):
         if step % args.eval_freq == 0 or step == args.max_timesteps:
             scalars = {k: x.item() for k, x in metrics.items()}  # waits for the GPU
             speed = (step - clock_step) / (time.perf_counter() - clock)
-            scores = evaluate(envs, agent.actor, mean, std, args)
-            row = {"step": step, **scores, **scalars}
-            row |= {"steps_per_second": speed, "best_discounted_return": best_return}
+            row = {"step": step} | evaluate(envs, agent.actor, mean, std, args)
+            row |= scalars | {"steps_per_second": speed}
+            row["best_discounted_return"] = best_return
             if not np.isfinite(list(row.values())).all():
                 raise UserError(
                     f"diverged by step {step}: {row}; the last checkpoint is kept"
@@ -582,6 +561,7 @@ def train(args):
             evaluations.append(row)
             checkpoint = {
                 "args": asdict(args),
+                "identity": identity,
                 "step": step,
                 "agent": {
                     k: x.state_dict() for k, x in vars(agent).items() if k != "args"
@@ -590,7 +570,7 @@ def train(args):
                 "evaluations": evaluations,
                 "mean": mean,
                 "std": std,
-                "max_action": max_action,
+                "max_action": agent.actor.max_action,
             }
             for name, value in row.items():
                 writer.add_scalar(name, value, step)
@@ -609,16 +589,13 @@ def train(args):
 
 def main():
     args = tyro.cli(Args, description=__doc__)
-    command = shlex.join(sys.orig_argv)
-    if args.run_dir not in sys.orig_argv:
-        command += " --run-dir " + shlex.quote(args.run_dir)
-    print(f"to continue: {command}")
+    print(f"to continue, add --run-dir {args.run_dir!r}")
     try:
         train(args)
-    except KeyboardInterrupt:
-        sys.exit(f"stopped; to continue: {command}")
     except (UserError, OSError, ImportError, gym.error.Error) as error:
         sys.exit(error)
+    except KeyboardInterrupt:
+        sys.exit("stopped")
 
 
 if __name__ == "__main__":

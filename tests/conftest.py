@@ -2,11 +2,13 @@
 """What tests share: the scripts as modules, small datasets, and runs in processes."""
 
 import csv
+import functools
 import os
 import shutil
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import h5py
@@ -17,9 +19,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 ROOT = Path(__file__).parents[1]
 DATASET = ROOT / "tests/data/halfcheetah_replay.hdf5"
-sys.path.insert(0, str(ROOT))  # the scripts are no package
+sys.path[:0] = [str(ROOT), str(ROOT / "tests/tools")]  # they are no packages
 torch.set_num_threads(1)  # enough for networks this small, whatever else runs
 torch.set_flush_denormal(True)  # as the scripts do
+
+import weights  # noqa: E402
 
 import td3_bc  # noqa: E402
 import wbc  # noqa: E402
@@ -31,6 +35,15 @@ SCRIPTS = {"wpc": wpc, "td3_bc": td3_bc, "wbc": wbc}
 @pytest.fixture(params=SCRIPTS)
 def script(request):
     return SCRIPTS[request.param]
+
+
+@functools.cache
+def wpc_with(weight):
+    """wpc.py with another of the paper's weights, as a module."""
+    module = types.ModuleType(f"wpc_{weight}")
+    sys.modules[module.__name__] = module  # where dataclasses look it up
+    exec(weights.with_weight(weight), vars(module))
+    return module
 
 
 def d4rl_arrays(rows, state_dim=17, action_dim=6, seed=0):
@@ -109,7 +122,6 @@ def run_here(script, *line):
     """Runs a command line in this process, which saves the seconds of a start."""
     time.sleep(1 - time.time() % 1)  # TensorBoard's files are in order by the second
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "orig_argv", [str(x) for x in line])
         patch.setattr(sys, "argv", [str(x) for x in line[1:]])
         script.main()
 

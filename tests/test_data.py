@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from conftest import DATASET, ROOT, SCRIPTS, d4rl_arrays, wpc, write_hdf5
+from conftest import DATASET, ROOT, SCRIPTS, d4rl_arrays, wpc, wpc_with, write_hdf5
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -84,10 +84,10 @@ fresh_folder_each = [HealthCheck.function_scoped_fixture]
 def test_random_files_load_as_in_a_slow_loop(tmp_path, arrays):
     path = write_hdf5(tmp_path / "data.hdf5", arrays)
     state_dim, action_dim = arrays["observations"].shape[1], arrays["actions"].shape[1]
-    options = {"discount": 0.9, "weight": "static"}
+    options = {"discount": 0.9, "script": wpc_with("static")}
     expected, episodes, best = slow_load(arrays, 0.9)
     if not expected:
-        with pytest.raises(wpc.UserError, match=r"\b0 transitions"):
+        with pytest.raises(wpc_with("static").UserError, match=r"\b0 transitions"):
             load_dataset(path, state_dim, action_dim, **options)
         return
     dataset, mean, std, best_return = load_dataset(
@@ -206,6 +206,7 @@ def test_d4rls_own_files_train_the_same_without_next_observations(tmp_path, robo
         assert same.all() or key == "next_observations"
 
 
+# Figure 4's weight, of the copy of wpc.py that tests/tools/weights.py writes
 HALVES = [([1, 3, 2], [0, 1, 1]), ([4, 1, 2, 3], [1, 0, 0, 1]), ([5, 5], [1, 1])]
 
 
@@ -216,7 +217,7 @@ def test_the_better_half_of_the_episodes(tmp_path, returns, half):
     arrays["terminals"] = np.arange(2 * len(returns)) % 2 == 1
     arrays["timeouts"] = np.zeros(2 * len(returns), bool)
     path = write_hdf5(tmp_path / "data.hdf5", arrays)
-    dataset, *_ = load_dataset(path, 1, 1, weight="static")
+    dataset, *_ = load_dataset(path, 1, 1, script=wpc_with("static"))
     expected = np.repeat(half, 2)[:-1].tolist()  # the last row gives no transition
     assert dataset["better_half"][:, 0].tolist() == expected
     assert "better_half" not in load_dataset(path, 1, 1)[0]  # Figure 4 alone needs it
@@ -252,8 +253,9 @@ def test_batches_are_uniform_with_replacement():
 def test_arrays_in_memory_stay_as_they_are():
     arrays = wpc.read_dataset(DATASET, 17, 6, 1.0)
     copies = {key: column.copy() for key, column in arrays.items()}
-    args = wpc.Args(env="halfcheetah", dataset="-", weight="static", device="cpu")
-    wpc.prepare_dataset(arrays, args)
+    static = wpc_with("static")
+    args = static.Args(env="halfcheetah", dataset="-", device="cpu")
+    static.prepare_dataset(arrays, args)
     assert arrays.keys() == copies.keys()
     assert all(np.array_equal(arrays[key], copies[key]) for key in arrays)
 
@@ -265,100 +267,6 @@ def test_the_scripts_load_alike():
         assert dataset.keys() == ours.keys()
         assert all(map(np.array_equal, facts, their_facts))
         assert all(torch.equal(dataset[key], ours[key]) for key in ours)
-
-
-def without(key):
-    return lambda arrays: arrays.pop(key)
-
-
-def replaced(key, change):
-    return lambda arrays: arrays.update({key: change(arrays[key])})
-
-
-def with_value(key, value):
-    def change(array):
-        array = array.astype(np.float64)
-        array[7] = value
-        return array
-
-    return replaced(key, change)
-
-
-def every(change):
-    return lambda arrays: arrays.update({k: change(v) for k, v in arrays.items()})
-
-
-NAN = "numbers must be finite"
-FLAGS = "terminals and timeouts 0 or 1"
-ROW_7 = "is wrong in 1 of 40 rows, first in row 7"
-BAD = [
-    (without("observations"), "has no observations, which"),
-    (without("actions"), "has no actions, which"),
-    (without("rewards"), "has no rewards, which"),
-    (without("terminals"), "has no terminals, which"),
-    (without("timeouts"), r"has no timeouts.*\(timeouts: 1 where an episode was cut"),
-    (lambda a: [a.pop("rewards"), a.pop("actions")], "has no actions and no rewards"),
-    (
-        replaced("actions", lambda x: x[:-1]),
-        r"actions must have shape \(N, 6\), with N the same .* has \(39, 6\)",
-    ),
-    (
-        replaced("timeouts", lambda x: x[:-2]),
-        r"timeouts must have shape \(N, 1\), .* has \(38, 1\)",
-    ),
-    (
-        replaced("observations", lambda x: x[:, :11]),
-        r"observations must have shape \(N, 17\), .* has \(40, 11\)",
-    ),
-    (replaced("actions", lambda x: x[:, :3]), r"actions must have .* \(40, 3\)"),
-    (replaced("actions", lambda x: x.T), r"has \(6, 40\) \(MATLAB's have their axes r"),
-    (every(lambda x: np.atleast_2d(x.T)), r"has \(.*, 40\) \(MATLAB's have their axes"),
-    (
-        replaced("rewards", lambda x: np.stack([x, x], 1)),
-        r"rewards must have shape \(N, 1\), .* has \(40, 2\)",
-    ),
-    (
-        lambda a: a.update(next_observations=a["observations"][:-1]),
-        r"next_observations must have shape \(N, 17\), .* has \(39, 17\)",
-    ),
-    (with_value("observations", np.nan), rf"observations {ROW_7} \(nan\): {NAN}"),
-    (with_value("actions", -np.inf), rf"actions {ROW_7} \(-inf\): {NAN}"),
-    (with_value("rewards", np.inf), rf"rewards {ROW_7} \(inf\): {NAN}"),
-    (with_value("terminals", np.nan), rf"terminals {ROW_7} \(nan\): {NAN}"),
-    (
-        lambda a: a.update(next_observations=np.full((40, 17), np.nan)),
-        rf"next_observations is wrong in 40 of 40 rows, first in row 0 \(nan\): {NAN}",
-    ),
-    (with_value("actions", 1.1), rf"actions {ROW_7} \(1\.1\): .* from -1 to 1$"),
-    (with_value("actions", -5), rf"actions {ROW_7} \(-5\): .* from -1 to 1$"),
-    (with_value("terminals", 255), rf"terminals {ROW_7} \(255\): .*{FLAGS}"),
-    (with_value("terminals", -1), rf"terminals {ROW_7} \(-1\): .*{FLAGS}"),
-    (with_value("terminals", 0.5), rf"terminals {ROW_7} \(0\.5\): .*{FLAGS}"),
-    (with_value("timeouts", 2), rf"timeouts {ROW_7} \(2\): .*{FLAGS}"),
-    (every(lambda x: x[:0]), r"\b0 transitions"),
-    (every(lambda x: x[:1]), r"\b0 transitions"),
-    (
-        lambda a: a.update(timeouts=np.ones(40, bool), terminals=np.zeros(40, bool)),
-        r"\b0 transitions",
-    ),
-    (
-        lambda a: a.update({"actions/arm": a.pop("actions"), "actions/leg": 1}),
-        "actions is a group of arm, leg",
-    ),
-]
-
-
-@pytest.mark.filterwarnings("error")  # and no warning stands before the sentence
-@pytest.mark.parametrize("spoil, sentence", BAD, ids=[sentence for _, sentence in BAD])
-def test_bad_files_are_refused_in_one_sentence(tmp_path, capsys, spoil, sentence):
-    arrays = d4rl_arrays(40)
-    spoil(arrays)
-    path = write_hdf5(tmp_path / "data.hdf5", arrays)
-    with pytest.raises(wpc.UserError, match=sentence) as stop:
-        load_dataset(path)
-    assert "\n" not in str(stop.value)
-    assert str(path) in str(stop.value) or "0 transitions" in sentence
-    assert capsys.readouterr() == ("", "")
 
 
 def test_actions_at_the_bounds_are_fine(tmp_path):

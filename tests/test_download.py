@@ -7,7 +7,6 @@ import http.server
 import io
 import re
 import subprocess
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -136,21 +135,6 @@ def test_d4rls_own_folder_is_in_the_home_folder(servers, monkeypatch, tmp_path):
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("HOME", str(tmp_path / "file"))
     assert "D4RL_DATASET_DIR" in refusal(wpc, "python", "wpc.py", "--env", TASK)
-
-
-OTHERS = ["ant-medium-v2", "HalfCheetah-v4", "hoper-medium-v2", "hopper", "hopper-v4"]
-OTHERS += ["hopper-medium-v0", "hopper-v2"]
-
-
-@pytest.mark.parametrize("name", OTHERS)
-def test_no_server_is_asked_for_other_names(monkeypatch, capsys, name):
-    monkeypatch.setattr(wpc, "download_dataset", pytest.fail)
-    monkeypatch.setattr(wpc, "make_envs", pytest.fail)
-    monkeypatch.setattr(sys, "argv", ["wpc.py", "--env", name])
-    with pytest.raises(SystemExit) as stop:
-        wpc.main()
-    assert stop.value.code == 2
-    assert f"--env {name} must be a task of D4RL's" in capsys.readouterr().err
 
 
 def test_names_and_digests_are_d4rls(monkeypatch, tmp_path):

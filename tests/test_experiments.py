@@ -12,18 +12,20 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 import tyro
-from conftest import ROOT, SCRIPTS, assert_one_sentence, run
+from conftest import ROOT, SCRIPTS, assert_one_sentence, run, wpc_with
 from scipy import stats
 
 sys.path.insert(0, str(ROOT / "tests/tools"))
 import experiments
 
 STEPS = range(10, 130, 10)  # twelve evaluations
+WEIGHTS = ("exponential", "random", "static")
+MODULES = SCRIPTS | {f"wpc_{weight}": wpc_with(weight) for weight in WEIGHTS}
 
 
 def make_run(folder, script, dataset, seed, scores, q=5.0, steps=STEPS, **arguments):
     """A run folder as the scripts leave it, with best_discounted_return 10."""
-    args = SCRIPTS[script].Args(
+    args = MODULES[script].Args(
         env="hopper", dataset=f"data/{dataset}.hdf5", seed=seed, **arguments
     )
     folder.mkdir(parents=True)
@@ -107,7 +109,7 @@ def test_the_scripts_take_the_commands(tool, experiment, runs):
     assert len(lines) == 2 * runs
     folders = set()
     for python, script, *words in lines:
-        args = tyro.cli(SCRIPTS[script.removesuffix(".py")].Args, args=words)
+        args = tyro.cli(MODULES[script.removesuffix(".py")].Args, args=words)
         assert python == "python"
         assert (args.max_timesteps, args.eval_freq) == (1_000_000, 10_000)
         folder, name = args.run_dir.split("/")
@@ -124,14 +126,14 @@ def test_the_list_says_what_the_paper_compared(tool):
         ["wpc.py", "td3_bc.py", "wbc.py"] * 12
     )
     lines = [" ".join(line) for line in listed(tool, "table2")]
-    assert sum("--weight=exponential" in line for line in lines) == 12 * 5
-    assert sum("--weight=random" in line for line in lines) == 12 * 5
+    assert sum("wpc_exponential.py" in line for line in lines) == 12 * 5
+    assert sum("wpc_random.py" in line for line in lines) == 12 * 5
     assert (
         sum("td3_bc.py --env hopper-medium-v2 --seed 4" in line for line in lines) == 1
     )
     assert not any("--dataset" in line for line in lines)
     first, second = (" ".join(line) for line in listed(tool, "figure4", "--seeds", 1))
-    assert "--env walker2d-medium-v2" in first and "--weight=static" in second
+    assert "--env walker2d-medium-v2" in first and "wpc_static.py" in second
     lines = [
         " ".join(line) for line in listed(tool, "runaway", "--seeds", 1, "--compiled")
     ]
@@ -163,7 +165,7 @@ def test_a_report_by_hand(tool, tmp_path):
     make_run(path / "1", "wpc", "hopper_medium", 1, scores(8), q=11, alpha=1.0)
     make_run(path / "2", "wpc", "hopper_medium", 2, scores(9), q=11, alpha=1.0)
     make_run(path / "3", "td3_bc", "hopper_medium", 0, 4, alpha=0.0)
-    make_run(path / "4", "wpc", "hopper_medium", 0, 6, weight="static")
+    make_run(path / "4", "wpc_static", "hopper_medium", 0, 6)
     out, tables = report(tool, tmp_path, tmp_path / "report")
     assert "passed over" not in out
 
@@ -385,17 +387,16 @@ def test_other_weights_and_what_is_drawn(tool, tmp_path, monkeypatch):
     """Each system's two runs have scores of their own, and Q is half a point higher."""
     drawn = catch_figures(monkeypatch)
     systems = {
-        "wPC": {},
-        "TD3+BC": {},
-        "wPC-e": {"weight": "exponential"},
-        "wPC-rnd": {"weight": "random"},
-        "static weight": {"weight": "static"},
+        "wPC": "wpc",
+        "TD3+BC": "td3_bc",
+        "wPC-e": "wpc_exponential",
+        "wPC-rnd": "wpc_random",
+        "static weight": "wpc_static",
     }
-    for i, (system, options) in enumerate(systems.items()):
-        script = "td3_bc" if system == "TD3+BC" else "wpc"
+    for i, script in enumerate(systems.values()):
         for seed in (0, 2):
             run = script, "hopper_medium", seed, 10 * i + seed
-            make_run(tmp_path / f"{i}/{seed}", *run, q=run[-1] + 0.5, **options)
+            make_run(tmp_path / f"{i}/{seed}", *run, q=run[-1] + 0.5)
     _, tables = report(tool, tmp_path, tmp_path / "report")
     (row,) = tables["Other weights (Table 2, Figure 4)"]
     names = list(systems)

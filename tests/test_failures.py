@@ -27,57 +27,7 @@ from conftest import (
 
 from wpc import UserError
 
-# Wrong arguments
-
-MISTAKES = [
-    (["--env", "NoRobot-v4"], "Environment `NoRobot` doesn't exist"),
-    (["--env", "hopper"], "observations must have shape (N, 11), with N the same"),
-    (["--env", "nowhere:Robot-v0"], "No module named 'nowhere'"),
-    (["--env", "HalfCheetah-v3"], "mujoco v2 and v3"),
-    (["--env", "Hopper-v2"], "mujoco v2 and v3"),
-    (["--device", "cuda:77"], "no --device cuda:77 here; cpu works"),
-    (["--device", "gpu"], "no --device gpu here; cpu works"),
-    (["--dataset", "nowhere.hdf5"], "nowhere.hdf5 can't be read: "),
-]
-
-
-@pytest.mark.parametrize("arguments, sentence", MISTAKES)
-def test_mistakes_get_one_sentence(monkeypatch, tmp_path, arguments, sentence):
-    monkeypatch.chdir(tmp_path)
-    assert sentence in refusal(wpc, *command("wpc", *arguments))
-    assert not (tmp_path / "runs").exists()
-
-
-NO_TASKS = ["HalfCheetah-v4", "ant-medium-v2", "hopper-v4", "hopper-v2"]
-NO_TASKS += ["hopper-medium-v0", "walker2d-medum-v2", "hopper-medium-v2-v2", "hopper-"]
-OUT_OF_BOUNDS = {
-    "steps, frequencies, episodes and batch_size must be >= 1": [
-        {"max_timesteps": 0},
-        {"eval_freq": 0},
-        {"eval_episodes": 0},
-        {"batch_size": 0},
-        {"policy_freq": -1},
-    ],
-    "discount and tau must be between 0 and 1": [
-        {"discount": 1.1},
-        {"discount": -0.1},
-        {"discount": float("nan")},
-        {"tau": 1.5},
-        {"tau": -0.5},
-    ],
-    "--env .* must be a task of D4RL's, .*medium-replay.*, or with --dataset": [
-        *[{"env": env} for env in NO_TASKS],
-        *[{"env": env, "dataset": "data.hdf5"} for env in NO_TASKS[2:]],
-    ],
-    "--env hopper must be a task of D4RL's": [{"env": "hopper"}],
-}
-CASES = [(options, text) for text, cases in OUT_OF_BOUNDS.items() for options in cases]
-
-
-@pytest.mark.parametrize("options, sentence", CASES)
-def test_arguments_out_of_bounds(script, options, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        script.Args(**options)
+# Arguments
 
 
 def test_the_bounds_themselves_are_fine(script):
@@ -87,21 +37,6 @@ def test_the_bounds_themselves_are_fine(script):
         script.Args(env=env)
     for env in ("hopper", "halfcheetah", "Hopper-v4", "Ant-v5", "my_envs:hopper-v0"):
         script.Args(env=env, dataset="data.hdf5")
-
-
-def test_a_mistake_ends_the_process_with_that_sentence(tmp_path):
-    """tyro puts it into a box."""
-    process = run(*command("wpc")[:2], "--env", "ant-medium-v2", cwd=tmp_path)
-    assert "--env ant-medium-v2 must be a task of D4RL's" in process.stderr
-    assert process.returncode == 2 and "Traceback" not in process.stderr
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_run_folders_that_cannot_be(tmp_path):
-    (tmp_path / "file").write_text("content")
-    for run_dir in (tmp_path / "file", tmp_path / "file/run"):
-        assert str(run_dir) in refusal(wpc, *command("wpc", "--run-dir", run_dir))
-    assert (tmp_path / "file").read_text() == "content"
 
 
 def test_a_notebooks_cell_and_another_machines_mujoco_gl(script):
@@ -196,7 +131,6 @@ def run_main(monkeypatch, script, error):
 
     monkeypatch.setattr(script, "train", train)
     monkeypatch.setattr(sys, "argv", ["script.py"])
-    monkeypatch.setattr(sys, "orig_argv", ["python", "script.py"])
     script.main()
 
 
@@ -223,12 +157,12 @@ def test_others_get_their_sentence(monkeypatch, script, error):
     assert stop.value.code  # no success
 
 
-def test_ctrl_c_ends_with_the_command_to_continue(monkeypatch, capsys, script):
+def test_ctrl_c_ends_without_a_traceback(monkeypatch, capsys, script):
     with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:
         run_main(monkeypatch, script, KeyboardInterrupt())
-    shown = stop.value.code.removeprefix("stopped; to continue: ")
-    assert shown.startswith("python script.py --run-dir runs/hopper-medium-v2__")
-    assert capsys.readouterr().out == f"to continue: {shown}\n"
+    assert stop.value.code == "stopped"
+    run_dir = "runs/hopper-medium-v2__"
+    assert capsys.readouterr().out.startswith(f"to continue, add --run-dir '{run_dir}")
 
 
 # Divergence

@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 import torch
 import tyro
+from conftest import wpc_with
 from scipy import stats
 
 ROOT = Path(__file__).parents[1]
@@ -42,7 +43,6 @@ MAP = {  # what the paper has, and how the line of wpc.py begins that does it
     "V fits y": "value_loss = F.mse_loss(v, y)",
     "every policy_freq steps": "if step % args.policy_freq == 0:",
     "**w(s, a), eq. 7**": "weight = (advantage > 0).float()  # eq. 7",
-    "w(s, a) of wPC-e, eq. 8": "return (advantage / args.beta).exp().clamp(max=100)",
     "lambda": "lmbda = args.alpha / q_pi.abs().mean().detach()",
     "the policy's objective, eq. 6": "actor_loss = -lmbda * q_pi.mean() + constraint",
     "targets follow": "soft_update(self.critic_target, self.critic, args.tau)",
@@ -169,7 +169,9 @@ def test_its_float32_run_ends_where_it_says():
 
 
 def arguments(script, words):
-    return vars(tyro.cli(importlib.import_module(Path(script).stem).Args, args=words))
+    name, _, weight = Path(script).stem.partition("wpc_")
+    module = wpc_with(weight) if weight else importlib.import_module(name)
+    return vars(tyro.cli(module.Args, args=words))
 
 
 def test_the_runs_have_the_arguments_of_their_commands():

@@ -5,7 +5,7 @@ identities between the three scripts."""
 import numpy as np
 import pytest
 import torch
-from conftest import SCRIPTS, networks, td3_bc, wbc, wpc
+from conftest import SCRIPTS, networks, td3_bc, wbc, wpc, wpc_with
 
 STATE_DIM, ACTION_DIM, MAX_ACTION, BATCH = 5, 3, 1.5, 64
 
@@ -18,11 +18,9 @@ OPTIONS = {
     "actor_lr": 1e-3,
     "critic_lr": 1e-4,
 }
-WEIGHTS = ["binary", "exponential", "random", "static"]
+OTHERS = {weight: wpc_with(weight) for weight in ("exponential", "random", "static")}
 CASES = [("td3_bc", {"alpha": 1.7}), ("wbc", {"value_lr": 2e-4})]
-for kind in WEIGHTS:
-    options = {"alpha": 1.7, "value_lr": 2e-4, "weight": kind, "beta": 0.02}
-    CASES.append(("wpc", options))
+CASES += [(name, {"alpha": 1.7, "value_lr": 2e-4}) for name in ("wpc", *OTHERS)]
 
 
 def make_agent(script, **options):
@@ -114,16 +112,15 @@ def advantage(nets, batch):
     return q_values(nets["critic"], s, a)[0] - mlp(nets["value"], s)
 
 
-def weight(kind, advantage, batch, permutation):
+def weight(name, advantage, batch, permutation):
     """Equations 7 and 8, wPC-rnd and the static weight."""
     binary = (advantage > 0).astype(float)
-    weights = {
-        "binary": binary,
-        "exponential": np.minimum(np.exp(advantage / 0.02), 100),
+    others = {
+        "exponential": np.exp(advantage),
         "random": binary[permutation],
         "static": batch["better_half"],
     }
-    return weights[kind]
+    return others.get(name, binary)
 
 
 def lmbda(nets, batch, alpha):
@@ -196,7 +193,7 @@ def assert_critics_and_value_agree(agent, batch, step):
 
 @pytest.mark.parametrize("name, options", CASES)
 def test_three_steps_agree_with_numpy(name, options):
-    agent = make_agent(SCRIPTS[name], **OPTIONS, **options)
+    agent = make_agent((SCRIPTS | OTHERS)[name], **OPTIONS, **options)
     batch, has_value = make_batch(), name != "td3_bc"
     arrays = {k: x.numpy() for k, x in batch.items()}
     if has_value:
@@ -218,7 +215,7 @@ def test_three_steps_agree_with_numpy(name, options):
         torch.manual_seed(2)
         torch.randn(BATCH, ACTION_DIM, dtype=torch.float64)  # the target's noise
         permutation = torch.randperm(BATCH).numpy()
-        w = weight(options.get("weight", "binary"), new, arrays, permutation)
+        w = weight(name, new, arrays, permutation)
         expected["weight"] = w.mean()
     lam = 0.0
     if "alpha" in options:
@@ -306,7 +303,7 @@ def assert_same(one, other):
 
 
 def test_wpc_with_weight_one_is_td3_bc():
-    ours = twenty_steps(wpc, better_half=1.0, alpha=2.5, weight="static")
+    ours = twenty_steps(OTHERS["static"], better_half=1.0, alpha=2.5)
     assert_same(ours, twenty_steps(td3_bc, alpha=2.5))
 
 
@@ -341,27 +338,22 @@ def test_an_action_that_is_as_good_as_average_has_weight_zero(script):
     assert agent.update(make_batch(), step=2)["weight"] == 0  # as Q = V = 0
 
 
-ADVANTAGES = torch.tensor([[-1e4], [-2.0], [-1e-3], [0.0], [1e-3], [0.5], [3.0], [1e4]])
-
-
-def other_weight(**options):
-    """wpc's weights of these advantages."""
-    weight = (ADVANTAGES > 0).float()
-    return wpc.other_weight(weight, ADVANTAGES, {}, wpc.Args(**options))
-
-
-@pytest.mark.parametrize("beta", [1.0, 0.1, 10.0])
-def test_exponential_weight_is_cut_off_at_100(beta):
-    expected = np.exp(np.minimum(ADVANTAGES.numpy() / beta, np.log(100)))  # eq. 8
-    weights = other_weight(weight="exponential", beta=beta).numpy()
-    assert weights == pytest.approx(expected, rel=1e-5)
+def test_exponential_weight_is_cut_off_at_100():
+    agent = make_agent(OTHERS["exponential"], critic_lr=0.0, value_lr=0.0)
+    agent.value.net[4].bias.data -= 1e4
+    assert agent.update(make_batch(), step=2)["weight"] == 100
 
 
 def test_random_weight_is_a_new_permutation_each_time():
-    torch.manual_seed(0)
-    draws = [other_weight(weight="random").flatten().tolist() for _ in range(8)]
-    assert all(sorted(draw) == [0] * 4 + [1] * 4 for draw in draws)
-    assert len({tuple(draw) for draw in draws}) > 4
+    """Drawn anew, the weights fall on other actions, so the policy's loss differs."""
+    agent, batch = make_agent(OTHERS["random"], actor_lr=0.0), make_batch()
+    agent.critic_optimizer.param_groups[0]["lr"] = 0.0
+    agent.value_optimizer.param_groups[0]["lr"] = 0.0
+    center_value(agent, batch)
+    all_metrics = [agent.update(batch, step=2) for _ in range(8)]
+    losses = {metrics["actor_loss"].item() for metrics in all_metrics}
+    means = {metrics["weight"].item() for metrics in all_metrics}
+    assert len(losses) == 8 and len(means) == 1
 
 
 def test_columns_of_one_axis_are_not_broadcast(script):
@@ -374,10 +366,3 @@ def test_columns_of_one_axis_are_not_broadcast(script):
         batch[name] = batch[name][:, 0]
         with pytest.raises(AssertionError, match=r"must be \(B, 1\)"):
             script.Agent(3, 1, 1.0, args).update(batch, 2)
-
-
-def test_a_new_weight_without_lines_of_its_own_says_so():
-    with pytest.raises(AssertionError, match="other_weight has no lines for mine"):
-        wpc.other_weight(
-            torch.ones(2, 1), torch.ones(2, 1), {}, wpc.Args(weight="mine")
-        )

@@ -5,10 +5,11 @@
     tr '\\n' '\\0' < commands.txt | xargs -0 -n 1 -P 2 sh -c
     python tests/tools/experiments.py report --runs runs/paper --out report
 
-`list` starts nothing; the second line, in the activated environment, runs what it
-lists, two at a time, and continues what was interrupted. With a GPU,
-tests/tools/together.py trains many of these runs at once. `report` reads every run
-folder below --runs, whatever its name.
+`list` starts nothing; table2 and figure4 need copies of wpc.py with other weights, such
+as wpc_random.py, which tests/tools/weights.py writes. The second line, in the activated
+environment, runs what it lists, two at a time, and continues what was interrupted. With
+a GPU, tests/tools/together.py trains many of these runs at once. `report` reads every
+run folder below --runs, whatever its name.
 """
 
 import csv
@@ -67,8 +68,8 @@ OF_WEIGHTS = {"exponential": "wPC-e", "random": "wPC-rnd", "static": "static wei
 NOT_COMPARED = "env dataset seed max_timesteps eval_freq eval_episodes device run_dir"
 EXPERIMENTS = {  # the scripts with what tells their runs apart, and the tasks
     "table1": ("wpc td3_bc wbc", TASKS),
-    "table2": ("wpc td3_bc wpc--weight=exponential wpc--weight=random", TASKS),
-    "figure4": ("wpc wpc--weight=static", ["walker2d-medium"]),
+    "table2": ("wpc td3_bc wpc_exponential wpc_random", TASKS),
+    "figure4": ("wpc wpc_static", ["walker2d-medium"]),
     "runaway": (
         "wpc wpc--alpha=1.0 wpc--alpha=0.5 wpc--alpha=0.1",
         ["walker2d-medium"],
@@ -161,18 +162,16 @@ def read_run(folder):
 
     task = Path(args["dataset"] or args["env"]).stem.replace("_", "-")
     task = task.removesuffix("-v2") + " (mean return)" * (score == "mean_return")
-    if "weight" in args:
-        script, system = "wpc", OF_WEIGHTS.get(args["weight"], "wPC")
-    elif "alpha" in args:
+    if "value_lr" not in args:
         script, system = "td3_bc", "TD3+BC" if args["alpha"] else "BC"
-    else:
+    elif "alpha" not in args:
         script, system = "wbc", "wBC"
+    else:
+        script, system = "wpc", OF_WEIGHTS.get(args.get("weight"), "wPC")
     env = "hopper-medium-expert-v2" if "medium-expert" in task else "hopper-medium-v2"
     defaults = vars(importlib.import_module(script).Args(env=env, dataset="-"))
     if system == "BC":
         defaults["alpha"] = 0
-    if system in OF_WEIGHTS.values():
-        defaults["weight"] = args["weight"]
     others = ", ".join(
         f"{name} {args[name]}"
         for name, default in defaults.items()
@@ -417,8 +416,7 @@ score is the mean of a run's last ten evaluations; over seeds: mean ± sample st
 deviation (seeds; training steps). What the paper and CORL have published is of D4RL's
 own files. "The data" is the mean score of the episodes trained on, where the report
 knows them (tests/results/datasets.csv); whose they are is in tests/results/README.md.
-Runs whose arguments, other than --weight, differ from the scripts' defaults are in the
-table on Q alone.
+Runs whose arguments differ from the scripts' defaults are in the table on Q alone.
 """
 NOTES = {
     "Differences": "Mean, 95% interval and p of Welch's t test, not corrected for "
