@@ -110,13 +110,13 @@ def without(name, **changes):
 
 
 SECOND = {
-    "no timeouts": (without("timeouts"), "has no timeouts, which D4RL's format needs"),
+    "no timeouts": (without("timeouts"), "D4RL's format has arrays of"),
     "next": (columns(1, with_next=True), "all with next_observations or all without"),
     "width": (without("", observations=np.zeros((20, 17))), "observations (17 wide)"),
     "the same": (columns(0), "hold the same data: name them once"),
-    "short": (without("", rewards=np.zeros(19)), "with N the same for all"),
-    "reversed": (without("", actions=np.zeros((3, 21))), "has (3, 21) (MATLAB's have"),
-    "255": (without("", terminals=np.full(20, 255)), "terminals is wrong in 20 of 20"),
+    "short": (without("", rewards=np.zeros(19)), "the same N for all"),
+    "reversed": (without("", actions=np.zeros((3, 21))), "MATLAB reverses the axes"),
+    "255": (without("", terminals=np.full(20, 255)), "terminals is wrong in 20"),
     "text": (without("", rewards="none"), "can't be read"),
     "no rows": ({x: y[:0] for x, y in columns(1).items()}, "b.hdf5 has no rows"),
 }

@@ -304,5 +304,5 @@ def test_each_run_leaves_what_its_script_leaves(tmp_path):
     assert score["mean_return"] == pytest.approx(float(rows[-1]["mean_return"]))
     before = (folder / "evaluations.csv").read_text()
     process = run(sys.executable, *shlex.split(lines[-1])[1:], cwd=ROOT)
-    assert_one_sentence(process, "was started with another made_by")
+    assert_one_sentence(process, "has another made_by: choose another --run-dir")
     assert (folder / "evaluations.csv").read_text() == before

@@ -23,7 +23,7 @@ import minari
 import numpy as np
 import pytest
 import torch
-from conftest import DATASET, ROOT, assert_one_sentence, run, run_here, wpc
+from conftest import DATASET, ROOT, assert_one_sentence, run, run_here, wpc, wpc_with
 from gymnasium.spaces import Box, Dict, Discrete
 from minari.data_collector import EpisodeBuffer
 from PIL import Image
@@ -490,9 +490,9 @@ def make(tmp_path, monkeypatch):
 
 def assert_nothing_is_lost(path, dataset, state_dim, action_dim):
     """The scripts make Minari's transitions of the file, and know its episodes."""
-    args = wpc.Args(weight="static")
     arrays = wpc.read_dataset(path, state_dim, action_dim, 2.0)
-    data, mean, std, _ = wpc.prepare_dataset(arrays, args)
+    static = wpc_with("static")
+    data, mean, std, _ = static.prepare_dataset(arrays, static.Args())
     for key in ("observations", "next_observations"):
         data[key] = data[key] * std + mean
     keys = ("observations", "actions", "rewards", "next_observations", "terminals")

@@ -172,6 +172,8 @@ def read_run(folder):
     defaults = vars(importlib.import_module(script).Args(env=env, dataset="-"))
     if system == "BC":
         defaults["alpha"] = 0
+    if system == "wPC":
+        defaults["weight"] = "binary"
     others = ", ".join(
         f"{name} {args[name]}"
         for name, default in defaults.items()

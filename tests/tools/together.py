@@ -21,6 +21,7 @@ it can't be continued.
 
 import copy
 import functools
+import hashlib
 import importlib
 import multiprocessing
 import os
@@ -33,6 +34,8 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
+import gymnasium as gym
+import mujoco
 import numpy as np
 import torch
 import torch.nn as nn
@@ -259,8 +262,13 @@ class Runs:
             networks.copy_to(i, self.actor.net)
             actor = copy.deepcopy(self.actor)
             _, mean, std, best_return = self.data[i]
+            identity = asdict(args) | {"dataset": [mean.tolist(), std.tolist()]}
+            identity["made_by"] = "together.py"  # so that no script goes on
+            for name in ("max_timesteps", "device", "run_dir"):
+                del identity[name]
             checkpoint = {
-                "args": asdict(args) | {"made_by": "together.py"},  # no script goes on
+                "args": asdict(args),
+                "identity": identity,
                 "agent": {"actor": actor.state_dict()},
                 "mean": mean,
                 "std": std,
@@ -310,8 +318,8 @@ class Evaluations:
             args, rows = self.runs.runs[i], self.rows[i]
             rows.append({"step": self.step} | future.result() | row)
             os.makedirs(args.run_dir, exist_ok=True)
-            record = wpc.describe_run(args) | self.made_by
-            wpc.save(Path(args.run_dir), checkpoint | {"evaluations": rows}, record)
+            checkpoint["evaluations"] = rows
+            wpc.save(Path(args.run_dir), checkpoint, asdict(args) | self.made_by)
         self.pending = []
 
 
@@ -408,6 +416,8 @@ def main():
     on_gpu = options.device == "cuda"
     made_by = {
         "made_by": "tests/tools/together.py",
+        "script_sha256": hashlib.sha256(wpc.SCRIPT.read_bytes()).hexdigest(),
+        **{x.__name__: x.__version__ for x in (torch, gym, mujoco, np)},
         "trained_on": torch.cuda.get_device_name() if on_gpu else "cpu",
         "matrix_products": "tf32" if options.tf32 else "float32",
     }
