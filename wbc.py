@@ -7,7 +7,7 @@ The policy imitates the dataset's actions that are better than average:
     w(s, a) = 1 if a is better than average, Q(s, a) > V(s), else 0       (eq. 7)
 
 Equations and Algorithm 1 are those of Peng, Han, Liu and Zhou, "Weighted Policy
-Constraints for Offline Reinforcement Learning", AAAI 2023 (below: the paper).
+Constraints for Offline Reinforcement Learning", AAAI 2023.
 
     python wbc.py --env hopper-medium-v2
     python wbc.py --env halfcheetah --dataset tests/data/halfcheetah_replay.hdf5
@@ -47,7 +47,7 @@ SCRIPT = Path(globals().get("__file__", "notebook"))  # a cell there has no file
 
 
 class UserError(Exception):
-    """What a user can mend, said in one sentence; main() prints it."""
+    """What a user can fix, said in one sentence; main() prints it."""
 
 
 @dataclass
@@ -196,11 +196,11 @@ class Agent:
             a_next = a_next.clamp(-max_action, max_action)
             q1_next, q2_next = self.critic_target(s_next, a_next)
             y = r + args.discount * (1 - done) * torch.min(q1_next, q2_next)
+        assert y.shape == a[..., :1].shape, "rewards and terminals must be (B, 1)"
 
         # Critics: Q1 and Q2 fit the target
         q1, q2 = self.critic(s, a)
         critic_loss = F.mse_loss(q1, y) + F.mse_loss(q2, y)
-        assert y.shape == q1.shape, "rewards and terminals must be (B, 1)"
         self.critic_optimizer.zero_grad()
         critic_loss.backward()
         self.critic_optimizer.step()
@@ -270,8 +270,8 @@ def d4rl_robot(env):
 def use_d4rl_physics(env):
     """Makes a -v4 robot move as in MuJoCo 2.0, with which D4RL was recorded.
 
-    A capsule then had the mass and inertia of a cylinder: that between its two caps,
-    lengthened by half the radius at each end.
+    A capsule then had the mass and inertia of a cylinder: its middle part, half a
+    radius longer at each end.
     """
     model = env.unwrapped.model
     spec = mujoco.MjSpec.from_file(env.unwrapped.fullpath)
@@ -299,7 +299,8 @@ def make_envs(env, num_envs):
     """`num_envs` environments for a task, robot or Gymnasium id, stepped together."""
     warnings.filterwarnings("ignore", ".*(out of date|settotalmass)")  # v4 is meant
     robot = d4rl_robot(env)
-    name, wrappers = (robot[0], [use_d4rl_physics]) if robot else (env, None)
+    name = robot[0] if robot else env
+    wrappers = [use_d4rl_physics] if robot else None
     envs = gym.make_vec(name, num_envs, vectorization_mode="sync", wrappers=wrappers)
     states, actions = envs.single_observation_space, envs.single_action_space
     time_limit = envs.spec.max_episode_steps
@@ -354,7 +355,7 @@ def download_dataset(task):
     folder = os.environ.get("D4RL_DATASET_DIR", "~/.d4rl/datasets")
     path = Path(folder, name).expanduser()
     for server in D4RL_SERVERS:
-        if path.exists():  # perhaps by now, as another process downloads it too
+        if path.exists():  # since this server or another process had it
             break
         try:
             print("downloading from", server)
@@ -386,9 +387,8 @@ def read_dataset(path, state_dim, action_dim, max_action):
     try:
         with h5py.File(path) as file:
             for key in widths:
-                if key in file or key != "next_observations":
-                    column = np.float32(file[key][:])
-                    arrays[key] = column[:, None] if column.ndim == 1 else column
+                if key in file or key != "next_observations":  # all others must be
+                    arrays[key] = np.c_[np.float32(file[key][:])]  # (N,) to (N, 1)
     except Exception as error:  # h5py raises nearly any type where a file is damaged
         raise UserError(
             f"{path} can't be read: {error}; D4RL's format has arrays of observations, "
@@ -404,7 +404,7 @@ def read_dataset(path, state_dim, action_dim, max_action):
         if key in ("terminals", "timeouts"):
             good = np.isin(column, (0, 1))
         if key == "actions":
-            good = np.abs(column) <= 1.001 * max_action  # as a policy's tanh rounds
+            good = np.abs(column) <= 1.001 * max_action  # rounding may exceed it
         bad = np.flatnonzero(~good.all(axis=1))
         if bad.size:
             raise UserError(
@@ -429,8 +429,8 @@ def prepare_dataset(arrays, args):
     """
     following = np.roll(arrays["observations"], -1, axis=0)
     arrays = {"next_observations": following} | arrays
-    terminals, timeouts = arrays["terminals"], arrays["timeouts"]
-    keep = np.flatnonzero((terminals >= timeouts)[:-1])
+    terminals, timeouts = arrays["terminals"], arrays.pop("timeouts")
+    keep = np.flatnonzero(((terminals == 1) | (timeouts == 0))[:-1])
     if not keep.size:
         raise UserError("the dataset has 0 transitions: it needs rows without timeout")
     rewards, ends = arrays["rewards"].ravel(), (terminals + timeouts).ravel() > 0
@@ -439,7 +439,6 @@ def prepare_dataset(arrays, args):
         return_to_go = reward + args.discount * return_to_go * (not end)
         best_return = max(best_return, return_to_go)
     dataset = {k: torch.tensor(x[keep], device=args.device) for k, x in arrays.items()}
-    del dataset["timeouts"]
     states = dataset["observations"].double()  # a sum of float32 would lose digits
     mean = states.mean(dim=0).float()
     std = states.std(dim=0, correction=0).float() + 1e-3
@@ -498,7 +497,7 @@ def resume(path, agent, identity):
     for name, state in checkpoint["agent"].items():
         getattr(agent, name).load_state_dict(state)
     torch.manual_seed(identity["seed"] + checkpoint["step"])  # a GPU draws new numbers
-    torch.set_rng_state(checkpoint["rng_state"])  # a CPU goes on with the old ones
+    torch.set_rng_state(checkpoint["rng_state"])  # a CPU goes on as it was
     return checkpoint
 
 
@@ -521,7 +520,7 @@ def set_up(args):
 
     path = args.dataset or download_dataset(args.env)
     arrays = read_dataset(path, state_dim, action_dim, max_action)
-    dataset, *others = prepare_dataset(arrays, args)
+    dataset, mean, std, best_return = prepare_dataset(arrays, args)
     print(
         f"{path} has {len(dataset['rewards']):,} transitions, "
         f"{dataset['terminals'].sum():.0f} of them terminal, with actions up to "
@@ -531,9 +530,9 @@ def set_up(args):
 
     torch.manual_seed(args.seed)
     agent = Agent(state_dim, action_dim, max_action, args)
-    # The other scripts build other networks: seeding again makes the batches equal.
+    # Seeded again, wpc.py, td3_bc.py and wbc.py draw the same batches.
     torch.manual_seed(args.seed)
-    return envs, agent, dataset, *others
+    return envs, agent, dataset, mean, std, best_return
 
 
 def train(args):
@@ -542,7 +541,8 @@ def train(args):
     Returns its evaluations, the rows of evaluations.csv as dictionaries.
     """
     envs, agent, dataset, mean, std, best_return = set_up(args)
-    # A run may go on elsewhere, or longer, but not with other arguments or other data.
+    # A run may go on elsewhere, or longer, but not with other arguments or other data,
+    # which mean and std tell, wherever the file is.
     identity = asdict(args) | {"dataset": [mean.tolist(), std.tolist()]}
     for name in ("max_timesteps", "device", "run_dir"):
         del identity[name]
@@ -571,15 +571,15 @@ def train(args):
         if step % args.eval_freq == 0 or step == args.max_timesteps:
             scalars = {k: x.item() for k, x in metrics.items()}  # waits for the GPU
             speed = (step - clock_step) / (time.perf_counter() - clock)
-            row = {"step": step} | evaluate(envs, agent.actor, mean, std, args)
-            row |= scalars | {"steps_per_second": speed}
+            scores = evaluate(envs, agent.actor, mean, std, args)
+            row = {"step": step, **scores, **scalars, "steps_per_second": speed}
             row["best_discounted_return"] = best_return
             if not np.isfinite(list(row.values())).all():
                 raise UserError(
                     f"diverged by step {step}: {row}; the last checkpoint is kept"
                 )
             if last_change(path) != saved:
-                raise UserError(f"{run_dir} is used by another process, too")
+                raise UserError(f"{run_dir} is used by another process too")
             evaluations.append(row)
             checkpoint = {
                 "args": asdict(args),

@@ -292,7 +292,7 @@ def test_two_processes_in_one_folder(tmp_path, monkeypatch):
 
     monkeypatch.setattr(wpc, "evaluate", evaluate)
     shown = refusal(wpc, *line)
-    assert shown == f"{tmp_path} is used by another process, too"
+    assert shown == f"{tmp_path} is used by another process too"
 
 
 def test_a_finished_run(run_dir, capsys):
