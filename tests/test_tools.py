@@ -8,6 +8,7 @@ all of Pendulum-v1's are cut off.
 """
 
 import hashlib
+import importlib.util
 import re
 import runpy
 import shlex
@@ -20,6 +21,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import h5py
 import minari
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -31,6 +33,7 @@ from scipy.stats import norm
 
 sys.path.insert(0, str(ROOT / "tests/tools"))
 import check_steps
+import eras  # noqa: F401, registers Hopper-before-3.5-v5
 import from_minari
 import make_dataset
 import play
@@ -676,6 +679,278 @@ def test_what_is_no_dataset_of_minaris(tmp_path, name):
     args = from_minari.Args(name, tmp_path / "data.hdf5")
     sentence = refusal_of(from_minari.main, args)
     assert "can't be opened or downloaded by Minari" in sentence
+
+
+# from_minari.py: the MuJoCo of the data, other packages, actions beyond the bounds
+
+
+def in_the_gymnasium(steps, era=None, **options):
+    """An episode of random actions in Hopper-v5, or in that of an era."""
+    env = gym.make(f"eras:Hopper-before-{era}-v5" if era else "Hopper-v5")
+    env.action_space.seed(0)
+    states, rows = [env.reset(seed=0)[0]], []
+    for _ in range(steps):
+        action = env.action_space.sample()
+        state, reward, *_ = env.step(action)
+        states.append(state)
+        rows.append((action, reward))
+    actions, rewards = zip(*rows, strict=True)
+    arrays = {"observations": np.array(states), "actions": np.array(actions)}
+    return buffer(0, steps, rewards=list(rewards), **arrays, **options)
+
+
+def shapes(state_dim, action_dim):
+    return {
+        "observations": np.zeros((4, state_dim)),
+        "actions": np.zeros((3, action_dim)),
+    }
+
+
+@pytest.fixture
+def make_robot(make):
+    """Makes a Minari dataset of one episode of a robot, and returns its name."""
+
+    def make_robot(episode, requirements=None, env="Hopper-v5"):
+        spaces = gym.make(env)
+        return make(
+            episode,
+            env=spaces.spec.id,
+            requirements=requirements,
+            observation_space=spaces.observation_space,
+            action_space=spaces.action_space,
+        )
+
+    return make_robot
+
+
+def output_of(capsys, name, out, **options):
+    """What from_minari.py prints: lines on the MuJoCo of the data, and --env."""
+    from_minari.main(from_minari.Args(name, out, **options))
+    _, *lines, command = capsys.readouterr().out.splitlines()
+    (env,) = re.findall(r"--env (\S+)", command)
+    assert env.startswith("eras:") == ("PYTHONPATH=tests/tools " in command)
+    return lines, env
+
+
+OLD = "eras:Hopper-before-3.5-v5"
+ASKS = "test/made-v0 requires mujoco{}, and Hopper-v5 moves otherwise on the"
+REQUIREMENTS = {  # of the set, beginnings of the printed lines, and --env
+    "before": (["mujoco==3.2.3"], [ASKS.format("==3.2.3")], OLD),
+    "patch": (["mujoco==3.4.*"], [ASKS.format("==3.4.*")], OLD),
+    "compatible": (["mujoco~=3.2.0"], [ASKS.format("~=3.2.0")], OLD),
+    "range": (["mujoco>=3.1,<3.2"], [ASKS.format("<3.2,>=3.1")], OLD),
+    "range in an era": (["mujoco>=3.5.1,<3.8"], [], "Hopper-v5"),
+    "below": (["mujoco>2.9,<=3.4"], [ASKS.format("<=3.4,>2.9")], OLD),
+    "twice": (["mujoco>=3.1", "mujoco<3.2"], [ASKS.format("<3.2,>=3.1")], OLD),
+    "text": ("mujoco==3.2.3", [ASKS.format("==3.2.3")], OLD),
+    "met": (["gymnasium>=1.0.0", f"mujoco=={mujoco.__version__}"], [], "Hopper-v5"),
+    "newer": (["mujoco==3.17.0"], [], "Hopper-v5"),
+    "too old": (
+        ["mujoco==2.1.0"],
+        ["Hopper-v5 moves otherwise on the installed mujoco"],
+        "Hopper-v5",
+    ),
+    "other package": (
+        ["gymnasium==0.29.1", "mujoco==3.4.0"],
+        [
+            "test/made-v0 requires gymnasium==0.29.1, and 1.",
+            ASKS.format("==3.4.0"),
+        ],
+        OLD,
+    ),
+    "malformed": (
+        ["numpy is needed", "mujoco==3.4.0"],
+        ["test/made-v0 requires numpy is needed, which pip", ASKS.format("==3.4.0")],
+        OLD,
+    ),
+    "not installed": (
+        ["gymnasium-nonsense>=1.2", "mujoco==3.4.0"],
+        [
+            "test/made-v0 requires gymnasium-nonsense>=1.2: pip install "
+            '"gymnasium-nonsense>=1.2"',
+            ASKS.format("==3.4.0"),
+        ],
+        OLD,
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    "requirements, lines, env", REQUIREMENTS.values(), ids=REQUIREMENTS
+)
+def test_the_environment_is_that_of_the_required_mujoco(
+    tmp_path, make_robot, capsys, monkeypatch, requirements, lines, env
+):
+    monkeypatch.setattr(from_minari, "which_physics", None)  # not asked
+    name = make_robot(in_the_gymnasium(3), requirements)
+    printed, chosen = output_of(capsys, name, tmp_path / "data.hdf5")
+    assert chosen == env
+    assert len(printed) == len(lines)
+    for line, expected in zip(printed, lines, strict=True):
+        assert line.startswith(expected)
+
+
+@pytest.mark.parametrize("requirements", [["mujoco==3.2.3"], ["mujoco>=2.3"], None])
+def test_a_robot_that_did_not_move_gets_no_warning(
+    tmp_path, make_robot, capsys, requirements
+):
+    name = make_robot(buffer(0, 3, **shapes(17, 6)), requirements, "Walker2d-v5")
+    assert output_of(capsys, name, tmp_path / "data.hdf5") == ([], "Walker2d-v5")
+
+
+OPEN = [None, [], ["mujoco"], ["mujoco>=3.1.0"], ["mujoco<3.6,>=3.2"], ["mujoco=3.2"]]
+
+
+@pytest.mark.parametrize("requirements", OPEN)
+@pytest.mark.parametrize("era", ["3.5", None])
+def test_where_requirements_leave_it_open_the_rows_decide(
+    tmp_path, make_robot, capsys, requirements, era
+):
+    name = make_robot(in_the_gymnasium(60, era), requirements)
+    printed, env = output_of(capsys, name, tmp_path / "data.hdf5")
+    if requirements == ["mujoco=3.2"]:
+        assert "requires mujoco=3.2, which pip would not und" in printed.pop(0)
+    if era:
+        (sentence,) = printed
+        assert env == OLD and sentence.endswith(f"--env {OLD}")
+    else:
+        assert (printed, env) == ([], "Hopper-v5")
+
+
+def test_what_is_not_known_is_said(tmp_path, make_robot, capsys):
+    name = make_robot(buffer(0, 3, **shapes(11, 3)))
+    (sentence,), env = output_of(capsys, name, tmp_path / "data.hdf5")
+    assert sentence.startswith("The file is") and "0% of the next states" in sentence
+    assert env == "Hopper-v5"
+
+
+def test_states_that_can_not_be_set(tmp_path, make_robot, capsys):
+    name = make_robot(buffer(0, 3, **shapes(23, 7)), None, "Pusher-v5")
+    (sentence,), env = output_of(capsys, name, tmp_path / "data.hdf5")
+    assert sentence.startswith("nothing is known of the MuJoCo of test/made-v0: Pusher")
+    assert env == "Pusher-v5"
+
+
+def test_positions_and_velocities_are_kept_where_each_row_has_them(tmp_path, make):
+    infos = {"qpos": np.arange(8.0).reshape(4, 2), "qvel": np.zeros((4, 2))}
+    short = infos | {"qvel": np.zeros((3, 2))}
+    name = make(buffer(0, 3, infos=short), buffer(1, 3, True, infos=infos))
+    data = tmp_path / "data.hdf5"
+    from_minari.main(from_minari.Args(name, data))
+    with h5py.File(data) as file:
+        assert list(file["infos"]) == ["qpos"]  # of qvel a row is missing
+        assert file["infos/qpos"][:, 0].tolist() == [0, 2, 4, 0, 2, 4, 6]
+        assert len(file["rewards"]) == 7
+
+
+def test_an_era_chosen_with_env(tmp_path, make_robot, capsys):
+    name = make_robot(in_the_gymnasium(3), ["mujoco==3.2.3"])
+    out = tmp_path / "data.hdf5"
+    assert output_of(capsys, name, out, env=OLD) == ([], OLD)
+
+
+def test_the_command_of_an_era_trains(tmp_path, make_robot, capsys):
+    name = make_robot(in_the_gymnasium(60), ["mujoco==3.2.3"])
+    from_minari.main(from_minari.Args(name, tmp_path / "my data.hdf5"))
+    command = capsys.readouterr().out.splitlines()[-1].removeprefix("to train: ")
+    command = f"{command} {shlex.join(map(str, SHORT))} --run-dir {tmp_path / 'run'}"
+    process = run("bash", "-c", command, cwd=ROOT)
+    assert process.returncode == 0, process.stderr
+    assert (tmp_path / "run/checkpoint.pt").exists()
+
+
+MODULE = """
+import gymnasium as gym
+from gymnasium.envs.classic_control.pendulum import PendulumEnv
+
+class Env(PendulumEnv):
+    pass
+
+gym.register("Own-v0", "own_module:Env", max_episode_steps=50)
+"""
+
+
+def test_an_environment_of_another_package_needs_no_env(
+    tmp_path, make, capsys, monkeypatch
+):
+    (tmp_path / "own_module.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    gym.make("own_module:Own-v0")
+    name = make(buffer(0, 3), env="Own-v0")
+    monkeypatch.delitem(gym.registry, "Own-v0")  # as where it was not imported
+    monkeypatch.delitem(sys.modules, "own_module")
+    printed, env = output_of(capsys, name, tmp_path / "data.hdf5")
+    assert (printed, env) == ([], "own_module:Own-v0")
+
+    monkeypatch.delitem(gym.registry, "Own-v0")
+    monkeypatch.delitem(sys.modules, "own_module")
+    (tmp_path / "own_module.py").unlink()
+    args = from_minari.Args(name, tmp_path / "data.hdf5")
+    sentence = refusal_of(from_minari.main, args)
+    assert "own_module:Own-v0 can't be made (ModuleNotFoundError: No mod" in sentence
+    assert "install what it needs" in sentence
+
+
+@pytest.mark.skipif(
+    not importlib.util.find_spec("gymnasium_robotics"),
+    reason="gymnasium-robotics, which requirements.txt leaves out, is not installed",
+)
+def test_the_hand_of_gymnasium_robotics(tmp_path, make_robot, capsys):
+    episode, env = buffer(0, 3, **shapes(45, 24)), "AdroitHandPen-v1"
+    name = make_robot(episode, ["mujoco==3.2.3"], f"gymnasium_robotics:{env}")
+    printed, env = output_of(capsys, name, tmp_path / "data.hdf5")
+    assert env == "eras:AdroitHandPen-before-3.3-v1"
+    assert len(printed) == 1 and "requires mujoco==3.2.3, and gymnasium_" in printed[0]
+
+
+gym.register("WidePendulum-v0", "test_tools:WidePendulum", max_episode_steps=200)
+
+
+class WidePendulum(gym.ActionWrapper):
+    """Clips actions of up to 4 to Pendulum's."""
+
+    def __init__(self):
+        super().__init__(gym.make("Pendulum-v1"))
+        self.action_space = Box(-4, 4, (1,))
+
+    def action(self, action):
+        return action.clip(-2, 2)
+
+
+BEYOND = np.float32([[-3.5], [2.0], [2.5]])
+
+
+def test_actions_beyond_the_bounds(tmp_path, make, capsys):
+    out = tmp_path / "data.hdf5"
+    args = from_minari.Args(make(buffer(0, 3, actions=BEYOND)), out)
+    assert refusal_of(from_minari.main, args) == (
+        "2 actions are beyond the bounds of Pendulum-v1, -2 and 2, and the largest is "
+        "3.5: add --clip, or name with --env an environment that clips"
+    )
+    assert not out.exists()
+
+    from_minari.main(from_minari.Args(args.dataset, out, clip=True))
+    assert "the largest is 3.5: clipped" in capsys.readouterr().out
+    assert read(out)["actions"].ravel().tolist() == [-2, 2, 2, 0]
+    wpc.read_dataset(out, 3, 1, 2.0)
+
+    # An environment that clips may take more than the recorded one.
+    from_minari.main(from_minari.Args(args.dataset, out, "WidePendulum-v0"))
+    printed = capsys.readouterr().out
+    assert "WidePendulum-v0 is taken to clip actions to [[-2.0], [2.0]]" in printed
+    assert read(out)["actions"].ravel().tolist() == [-3.5, 2, 2.5, 0]
+    wpc.read_dataset(out, 3, 1, 4.0)
+
+
+@pytest.mark.parametrize("largest", [2.0, 2.002])
+def test_actions_that_the_scripts_take_are_not_clipped(tmp_path, make, capsys, largest):
+    actions = np.float32([[-largest], [0], [largest]])
+    name = make(buffer(0, 3, actions=actions))
+    for clip in (False, True):
+        args = from_minari.Args(name, tmp_path / "data.hdf5", clip=clip)
+        from_minari.main(args)
+        assert len(capsys.readouterr().out.splitlines()) == 2
+        assert np.array_equal(read(args.out)["actions"][:3], actions)
 
 
 # play.py
