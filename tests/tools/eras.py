@@ -31,7 +31,7 @@ MOVED = {  # the environments, and by which of these releases they were moved
     "AdroitHand(Door|Relocate).*": ("3.3", "3.5"),
     "(antmaze|antsoccer)-.*": ("3.5",),  # OGBench's, as are the lower-case names below
 }
-STAYED = (
+STAYED = (  # those that no release has moved
     "(HalfCheetah|Walker2d|Swimmer|Reacher|InvertedPendulum|InvertedDoublePendulum)"
     "-v[45]|(pointmaze|humanoidmaze)-.*"
 )
@@ -54,13 +54,11 @@ def use_era(env, before):
     """Makes `env` move as it did before MuJoCo's release `before`, one of ERAS."""
     model, flags = env.unwrapped.model, mujoco.mjtDisableBit
     changed = [x for x in ERAS if Version(before) <= Version(x) <= INSTALLED]
-    if (
-        "3.3" in changed
-    ):  # a collision of meshes, ellipsoids, ... was computed otherwise
+    if "3.3" in changed:  # the collisions of meshes, ellipsoids, cylinders
         model.opt.disableflags |= flags.mjDSBL_NATIVECCD
-    if "3.5" in changed:  # of a contact's two margins the larger counted, now their sum
+    if "3.5" in changed:  # a contact's margins are added; the larger one counted
         model.geom_margin /= 2  # exact where all are equal
-    if "3.8" in changed:  # two convex geoms had one contact, now they have several
+    if "3.8" in changed:  # two convex geoms meet in several points, not in one
         model.opt.disableflags |= flags.mjDSBL_MULTICCD
     return env
 
