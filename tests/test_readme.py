@@ -537,7 +537,7 @@ def test_its_hours_are_those_of_the_measured_speeds():
 def test_what_it_says_of_the_zoos_agents_is_in_its_table():
     row = r"^\| (\w+ \w+) \| (\d+) ± (\d+) \| (\d+) ± (\d+) \| (\d+) ± (\d+) \|$"
     d4rl, stock = {}, {}
-    for agent, *numbers in re.findall(row, README, re.M):
+    for agent, *numbers in re.findall(row, RESULTS, re.M):
         published, *ours = np.array(numbers, float).reshape(3, 2)
         for (mean, std), values in zip(ours, (d4rl, stock), strict=True):
             test = stats.ttest_ind_from_stats(
@@ -545,9 +545,9 @@ def test_what_it_says_of_the_zoos_agents_is_in_its_table():
             )
             values[agent] = test.pvalue
             assert values is d4rl or mean < published[0]
-    assert len(d4rl) == 6 and f"(p ≥ {min(d4rl.values()):.2f}, Welch's t" in README
+    assert len(d4rl) == 6 and f"(p ≥ {min(d4rl.values()):.2f}, Welch's t" in RESULTS
     assert stock.pop("TQC HalfCheetah") > 0.05
-    assert f"fall short (p ≤ {max(stock.values()):.2f}):" in README
+    assert f"fall short (p ≤ {max(stock.values()):.2f}):" in RESULTS
 
 
 def prose(text):
