@@ -191,14 +191,6 @@ def test_a_report_by_hand(tool, tmp_path):
     hopper, _ = tables["Differences"]
     assert hopper["wPC - TD3+BC"] == hopper["wPC - wBC"] == expected
 
-    totals = [list(row.values()) for row in tables["Totals"]]
-    assert totals == [  # the paper's on the same two tasks, CORL's, the paper's in all
-        ["wPC", "2", "14.0", "172.5", "-", "800.7"],
-        ["TD3+BC", "2", "28.0", "140.9", "143.1", "712.9"],
-        ["wBC", "2", "28.0", "145.2", "-", "712.7"],
-        ["BC", "1", "4.0", "52.9", "53.5", "475.5"],
-    ]
-
     (row,) = tables["Other weights (Table 2, Figure 4)"]
     assert row["static weight"] == "6.0 (1; 0.12k)" and row["wPC-e, paper"] == "67.0"
     assert row["wPC"] == "2.0 ± 1.0 (3; 0.12k)"
@@ -213,8 +205,7 @@ def test_a_report_by_hand(tool, tmp_path):
     assert row["at step"] == "10 to 30"
     assert row["seeds over 1"] == "3" and row["back"] == "1"
 
-    names = {"figure2", "figure3", "figure4", "runaway"}
-    assert figures(tmp_path / "report") == names
+    assert figures(tmp_path / "report") == {"figure2", "figure3", "figure4"}
 
 
 def test_runs_of_unequal_length(tool, tmp_path):
@@ -226,8 +217,7 @@ def test_runs_of_unequal_length(tool, tmp_path):
         steps = (shorter, longer)[seed]
         path = tmp_path / f"td3_bc{seed}"
         make_run(path, "td3_bc", "hopper_medium", seed, seed, steps=steps)
-    out, tables = report(tool, tmp_path, tmp_path / "report")
-    assert "('hopper-medium', 'TD3+BC', '') counts to step 100, not to 200" in out
+    _, tables = report(tool, tmp_path, tmp_path / "report")
     (row,) = with_runs(tables["Table 1"])
     # Steps 155, 160, ..., 200; seed 1 scores one more
     assert row["wPC"] == "178.0 ± 0.7 (2; 0.2k)"
@@ -292,7 +282,8 @@ def test_runs_on_different_data_are_no_seeds_of_one_system(tool, tmp_path):
     printed, tables = report(tool, tmp_path, tmp_path / "report")
     (row,) = with_runs(tables["Table 1"])
     assert row["wPC"] == "10.0 ± 0.0 (2; 0.12k)" and row["wBC"] == "-"
-    assert "'wBC', '') (different data, with best returns 10.0 and 11.0)" in printed
+    assert "'wBC', '') (its runs share 12 evaluations, on data with" in printed
+    assert "best returns of 10.0 and 11.0)" in printed
 
 
 def test_systems_on_different_data_are_not_compared(tmp_path):
@@ -322,12 +313,6 @@ def test_q_is_drawn_where_returns_are_negative(tmp_path, monkeypatch):
         draw = [("pendulum", "Q", [curve], [(best, "black", "--")])]
         experiments.draw(tmp_path / "q.png", draw)
     assert scales == ["linear", "linear", "log"]
-    groups = {}
-    for alpha in (1.0, 2.5):
-        key = "pendulum", "wPC", f"alpha {alpha}"
-        values = np.ones((2, 3, 10))
-        groups[key] = experiments.Group(*key, alpha, -0.3, steps, *values)
-    assert experiments.runaway_panels(groups) == []
 
 
 def test_what_is_kept_apart(tool, tmp_path):
@@ -351,7 +336,7 @@ def test_what_is_kept_apart(tool, tmp_path):
         "hopper-medium-expert": ("30.0 (1; 0.12k)", "-"),
         "hopper-medium (mean return)": ("-", "3.0 (1; 0.12k)"),
     }
-    assert figures(tmp_path / "report") == {"figure2", "runaway"}
+    assert figures(tmp_path / "report") == {"figure2"}
     rows = tables["When does Q run away?"]
     assert {(row["arguments"], row["score"]) for row in rows} == {
         ("alpha 2.5", "10.0"),
@@ -376,12 +361,10 @@ def test_the_data_have_a_score_of_their_own(tmp_path, monkeypatch):
     path = tmp_path / "tests/results/datasets.csv"
     path.parent.mkdir(parents=True)
     path.write_text(
-        "task,transitions,mean_score,best_return\nhopper-medium,1000,44.2,10.0\n"
-        "walker2d-medium,2000,9,11.0\n"
+        "task,mean_score,best_return\nhopper-medium,44.2,10.0\nwalker2d-medium,9,11.0\n"
     )
     table = experiments.score_table(groups, ["hopper-medium", "walker2d-medium"], [])
-    rows = ["| hopper-medium | 44.2 | 1,000, of D4RL's policy |"]
-    rows.append("| walker2d-medium | - | - |")
+    rows = ["| hopper-medium | 44.2 |", "| walker2d-medium | - |"]
     assert table.splitlines()[2:] == rows
 
 
@@ -391,7 +374,7 @@ def test_a_report_on_tasks_of_ones_own(tool, tmp_path):
     _, tables = report(tool, tmp_path, tmp_path / "report")
     (row,) = tables["Table 1"]
     assert row["task"] == "mine" and row["BC"] == "10.0 (1; 0.12k)"
-    assert "Totals" not in tables and figures(tmp_path / "report") == set()
+    assert figures(tmp_path / "report") == set()
 
 
 def test_a_report_without_runs(tmp_path):
@@ -404,21 +387,19 @@ def test_other_weights_and_what_is_drawn(tool, tmp_path, monkeypatch):
     """Each system's two runs have scores of their own, and Q is half a point higher."""
     drawn = catch_figures(monkeypatch)
     systems = {
-        "wPC": {},
-        "TD3+BC": {},
-        "wPC-e": {"script": "wpc_exponential"},
-        "wPC-rnd": {"script": "wpc_random"},
-        "static weight": {"script": "wpc_static"},
-        "alpha 1.0": {"alpha": 1.0},
+        "wPC": "wpc",
+        "TD3+BC": "td3_bc",
+        "wPC-e": "wpc_exponential",
+        "wPC-rnd": "wpc_random",
+        "static weight": "wpc_static",
     }
-    for i, (system, options) in enumerate(systems.items()):
-        script = options.pop("script", "td3_bc" if system == "TD3+BC" else "wpc")
+    for i, script in enumerate(systems.values()):
         for seed in (0, 2):
             run = script, "hopper_medium", seed, 10 * i + seed
-            make_run(tmp_path / f"{i}/{seed}", *run, q=run[-1] + 0.5, **options)
+            make_run(tmp_path / f"{i}/{seed}", *run, q=run[-1] + 0.5)
     _, tables = report(tool, tmp_path, tmp_path / "report")
     (row,) = tables["Other weights (Table 2, Figure 4)"]
-    names = list(systems)[:5]
+    names = list(systems)
     assert [float(row[name].split()[0]) for name in names] == [1, 11, 21, 31, 41]
     (row,) = tables["Differences to other weights"]
     differences = [row[f"wPC - {name}"].split(" [")[0] for name in names[2:]]
@@ -430,8 +411,7 @@ def test_other_weights_and_what_is_drawn(tool, tmp_path, monkeypatch):
         return {name: [x.mean() for x in band] for name, _, _, band in shown}
 
     expected = {name: [10 * i, 10 * i + 1, 10 * i + 2] for i, name in enumerate(names)}
-    assert [panel[0] for panel in drawn["figure2"]] == experiments.TASKS
-    (panel,) = (panel for panel in drawn["figure2"] if panel[2])
+    (panel,) = drawn["figure2"]
     assert panel[0] == "hopper-medium" and curves(panel) == {
         name: expected[name] for name in names[:2]
     }
@@ -443,9 +423,6 @@ def test_other_weights_and_what_is_drawn(tool, tmp_path, monkeypatch):
     (panel,) = drawn["figure5"]
     assert curves(panel) == {name: expected[name] for name in names[:4]}
     assert [level for level, *_ in panel[3]] == [86.5, 57.7, 67.0, 66.5]  # the paper's
-    q, scores = drawn["runaway"]
-    assert curves(q)["alpha 1.0"] == pytest.approx([5.05, 5.15, 5.25])
-    assert curves(scores)["alpha 1.0"] == [50, 51, 52]
 
 
 # --- What is stored -------------------------------------------------------------------

@@ -6,6 +6,7 @@ import re
 import sys
 import types
 import zipfile
+from pathlib import Path
 
 import gymnasium as gym
 import mujoco
@@ -203,16 +204,19 @@ def refusal(function, *arguments):
     return str(stop.value)
 
 
-def own(robot, numbers):
-    """Random episodes in the form of a file, {name: array}."""
-    names = ["observations", "actions", "rewards", "next_observations"]
-    columns, _ = make_dataset.play(robot, None, 0, numbers)
-    return dict(zip([*names, "terminals", "timeouts"], columns, strict=True))
+def own(robot, steps):
+    """Random episodes of at most so many steps in the form of a file, {name: array}."""
+    env = wpc.make_envs(robot, 1).envs[0]
+    data = make_dataset.make_columns(steps, env)
+    args = make_dataset.Args(robot, steps, Path("unused"))
+    list(make_dataset.collect(args, env, data))
+    *_, end = np.flatnonzero(data["terminals"] | data["timeouts"])
+    return {name: column[: end + 1] for name, column in data.items()}
 
 
 def test_check_physics_on_transitions_of_our_own(tmp_path, capsys):
     """In D4RL's physics, one of them as if D4RL had clipped it, one wrong."""
-    data = own("hopper", range(5))
+    data = own("hopper", 100)
     data["observations"][0, 8] = 10
     data["timeouts"] = data["terminals"]  # such rows stay
     rows = len(data["rewards"])
@@ -315,7 +319,7 @@ def test_check_physics_on_files_of_other_releases(capsys, tmp_path, env_id):
 
 def test_a_robot_that_no_release_moved():
     env_id, sentence = check_physics.which_physics(
-        own("Walker2d-v5", [0]), "Walker2d-v5"
+        own("Walker2d-v5", 60), "Walker2d-v5"
     )
     alike = " or ".join([*ERAS, STOCK])
     assert env_id == "Walker2d-v5" and f"is of {alike}, which are alike" in sentence
@@ -331,7 +335,7 @@ def test_rows_that_are_alike_in_all():
 
 def test_releases_after_the_installed_one_are_not_tried(monkeypatch):
     monkeypatch.setattr(eras, "INSTALLED", Version("3.4.0"))
-    physics, _ = check_physics.try_physics(own("Ant-v5", [0]), "Ant-v5", 10)
+    physics, _ = check_physics.try_physics(own("Ant-v5", 1000), "Ant-v5", 10)
     assert [name for name, *_ in physics] == [ERAS[0], "mujoco==3.4.0"]
 
 

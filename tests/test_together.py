@@ -5,10 +5,10 @@ import contextlib
 import csv
 import importlib
 import json
+import pickle
 import shlex
 import sys
 from concurrent.futures import Future
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -20,29 +20,19 @@ from conftest import DATASET, ROOT, assert_one_sentence, load, run, td3_bc, wbc,
 sys.path.insert(0, str(ROOT / "tests/tools"))
 together = importlib.import_module("together")
 
-SMALL, LARGE = (5, 2, 1.0), (7, 3, 1.0)
+DIMS = 5, 2, 1.0
 OPTIONS = {"device": "cpu", "policy_noise": 0.0, "batch_size": 16}
 # Without noise, which is drawn for all runs together.
 OPTIONS |= {"discount": 0.9, "tau": 0.1, "actor_lr": 1e-3, "critic_lr": 1e-4}
 OPTIONS |= {"value_lr": 1e-3, "beta": 0.5}  # of the scripts that have them
-RUNS = [
-    (td3_bc, SMALL, {"alpha": 1.0}),
-    (wpc, LARGE, {"alpha": 2.5}),
-    (wpc, SMALL, {"alpha": 0.1, "seed": 1}),
-    (td3_bc, LARGE, {"alpha": 0.0, "seed": 2}),
-    (wbc, SMALL, {"seed": 3}),
-    (wbc, LARGE, {}),
-    (wpc, SMALL, {"alpha": 2.5, "weight": "exponential"}),
-    (wpc, LARGE, {"alpha": 2.5, "weight": "static"}),
+RUNS = [  # with one of two datasets
+    (td3_bc, 0, {"alpha": 1.0}),
+    (wpc, 1, {"alpha": 2.5}),
+    (wpc, 0, {"alpha": 0.1, "seed": 1}),
+    (td3_bc, 1, {"alpha": 0.0, "seed": 2}),
+    (wbc, 0, {"seed": 3}),
+    (wbc, 1, {}),
 ]
-
-
-@pytest.fixture(autouse=True)
-def other_weight():
-    """Of wpc.py, which together.py replaces."""
-    ours = wpc.other_weight
-    yield
-    wpc.other_weight = ours
 
 
 @pytest.fixture
@@ -52,45 +42,40 @@ def float64():
     torch.set_default_dtype(torch.float32)
 
 
-def make_dataset(dims, rows=100):
-    state_dim, action_dim, _ = dims
+def make_dataset(rows):
+    state_dim, action_dim, _ = DIMS
     return {
         "observations": torch.randn(rows, state_dim),
         "actions": torch.randn(rows, action_dim).tanh(),
         "rewards": torch.randn(rows, 1),
         "next_observations": torch.randn(rows, state_dim),
         "terminals": (torch.rand(rows, 1) < 0.1).double(),
-        "better_half": (torch.rand(rows, 1) < 0.5).double(),
     }
 
 
 def make_runs():
     torch.manual_seed(0)
-    datasets = {SMALL: make_dataset(SMALL), LARGE: make_dataset(LARGE, rows=150)}
-    all_dims = [dims for _, dims, _ in RUNS]
+    datasets = make_dataset(100), make_dataset(150)
     data = [  # mean, std and best return tell the runs apart
-        (datasets[dims], torch.tensor(i), torch.tensor(1), float(i))
-        for i, dims in enumerate(all_dims)
+        (datasets[number], torch.tensor(i), torch.tensor(1), float(i))
+        for i, (_, number, _) in enumerate(RUNS)
     ]
     args = []
     for script, _, options in RUNS:
         own = {k: v for k, v in OPTIONS.items() if hasattr(script.Args, k)}
         args.append(script.Args(**own, **options))
-    return together.Runs(args, all_dims, data, "cpu")
+    return together.Runs(args, DIMS, data, "cpu")
 
 
 def test_each_run_is_trained_as_by_its_script(float64):
     runs, singles = make_runs(), []
-    for (script, dims, _), args in zip(RUNS, runs.runs, strict=True):
+    for (script, _, _), args in zip(RUNS, runs.runs, strict=True):
         torch.manual_seed(args.seed)
-        singles.append(script.Agent(*dims, args))
-    traced, wpc.other_weight = wpc.other_weight, together.WPC_WEIGHT
+        singles.append(script.Agent(*DIMS, args))
     for step in range(1, 11):
         indices = torch.randint(100, (len(RUNS), 16))
         rows = runs.start + indices
-        wpc.other_weight = traced
         runs.update({name: x[rows] for name, x in runs.columns.items()}, step)
-        wpc.other_weight = together.WPC_WEIGHT
         for i, (single, (dataset, *_)) in enumerate(
             zip(singles, runs.data, strict=True)
         ):
@@ -98,15 +83,12 @@ def test_each_run_is_trained_as_by_its_script(float64):
             for name, metric in single.update(batch, step).items():
                 ours = runs.metrics[name].flatten()[i].item()
                 assert ours == pytest.approx(metric.item(), rel=1e-9, abs=1e-12)
-    for i, (single, own) in enumerate(zip(singles, runs.actors, strict=True)):
-        for network in (runs.agent.actor, runs.agent.actor_target):
-            network.net.copy_to(i, own.net)
-            expected = (
-                single.actor if network is runs.agent.actor else single.actor_target
-            )
-            for key, tensor in expected.state_dict().items():
-                torch.testing.assert_close(own.state_dict()[key], tensor)
-        critic = wpc.Critic(*RUNS[i][1][:2])
+    actor, critic = wpc.Actor(*DIMS), wpc.Critic(*DIMS[:2])
+    for i, single in enumerate(singles):
+        for network in ("actor", "actor_target"):
+            getattr(runs.agent, network).net.copy_to(i, actor.net)
+            for key, tensor in getattr(single, network).state_dict().items():
+                torch.testing.assert_close(actor.state_dict()[key], tensor)
         for network in ("critic", "critic_target"):
             for q, net in enumerate((critic.q1_net, critic.q2_net)):
                 row = i + q * len(RUNS)
@@ -126,13 +108,16 @@ def test_each_run_samples_its_own_rows(float64):
 
 def test_each_run_is_evaluated_by_itself(float64):
     """With its own policy, normalization and metrics."""
-    runs = make_runs()
+    runs, own = make_runs(), wpc.Actor(*DIMS)
     runs.two_steps()
-    for i, ((args, dims, actor, mean, _), row) in enumerate(runs.snapshot()):
-        assert (args, dims, mean) == (runs.runs[i], RUNS[i][1], i)
-        runs.agent.actor.net.copy_to(i, runs.actors[i].net)
-        for key, tensor in runs.actors[i].state_dict().items():
-            assert np.array_equal(actor[key], tensor), key
+    for i, (job, checkpoint, row) in enumerate(list(runs.snapshot())):
+        args, actor, mean, std = job
+        assert (args, mean, std) == (runs.runs[i], i, 1)
+        assert (checkpoint["mean"], checkpoint["std"]) == (i, 1)
+        runs.agent.actor.net.copy_to(i, own.net)
+        for key, tensor in own.state_dict().items():
+            assert torch.equal(actor.state_dict()[key], tensor), key
+            assert torch.equal(checkpoint["agent"]["actor"][key], tensor), key
         assert row["best_discounted_return"] == i
         assert row["q"] == runs.metrics["q"].flatten()[i]
 
@@ -140,31 +125,25 @@ def test_each_run_is_evaluated_by_itself(float64):
 class Pool:
     """Evaluates at once, in this process."""
 
-    def submit(self, function, *job):
+    def submit(self, function, job):
         future = Future()
-        future.set_result(function(*job))
+        future.set_result(function(job))
         return future
 
 
-@pytest.mark.parametrize("seconds, last", [(float("inf"), 60), (0, 20)])
-def test_a_row_is_of_as_many_steps_as_it_says(
-    float64, monkeypatch, tmp_path, seconds, last
-):
-    """The first run is of 60 steps, the others of 20; --seconds ends all of them."""
+def test_a_row_is_of_as_many_steps_as_it_says(float64, monkeypatch, tmp_path):
     runs, done = make_runs(), []
     for i, args in enumerate(runs.runs):
-        args.eval_freq, args.max_timesteps = 20, 20 if i else 60
+        args.eval_freq, args.max_timesteps = 20, 60
         args.run_dir = str(tmp_path / str(i))
     monkeypatch.setattr(runs, "compile", lambda _: done.append(2))
-    monkeypatch.setattr(runs, "do", done.append)
-    monkeypatch.setattr(together, "evaluate_run", lambda *_: {"mean_return": sum(done)})
-    options = together.Options(Path("none"), seconds, device="cpu", compile=False)
-    together.train(runs, options, Pool(), {})
-    together.write_runs(runs, {})
-    for i, end in enumerate([last, *[20] * (len(RUNS) - 1)]):
+    monkeypatch.setattr(runs, "two_compiled_steps", lambda: done.append(2))
+    monkeypatch.setattr(together, "evaluate_run", lambda _: {"mean_return": sum(done)})
+    together.train(runs, together.Evaluations(runs, Pool(), {}))
+    for i in range(len(RUNS)):
         rows = csv.DictReader((tmp_path / str(i) / "evaluations.csv").open())
         steps = [(int(row["step"]), float(row["mean_return"])) for row in rows]
-        assert steps == [(step, step) for step in range(0, end + 1, 20)]
+        assert steps == [(step, step) for step in range(0, 61, 20)]
 
 
 def test_the_traced_steps_are_the_steps(float64):
@@ -174,7 +153,8 @@ def test_the_traced_steps_are_the_steps(float64):
         plain.two_steps()
     torch.manual_seed(1)
     traced.compile(lambda graph, inputs: graph)
-    traced.do(10)
+    for _ in range(5):
+        traced.two_compiled_steps()
     for name, network in traced.agent.actor.named_parameters():
         expected = plain.agent.actor.get_parameter(name)
         torch.testing.assert_close(network, expected)
@@ -191,8 +171,9 @@ def test_the_traced_steps_are_the_steps(float64):
         (["td3_bc.py", "wbc.py", "wpc.py --value-lr 1"], "the same value_lr"),
         (["wpc.py", "td3_bc.py --eval-freq 10"], "the same eval_freq"),
         (["wpc.py --policy-freq 1"], "runs with policy_freq 2"),
-        (["wpc.py --eval-freq 15"], "an eval_freq that 10 divides"),
-        (["wpc.py", "wbc.py --max-timesteps 7777"], "must divide each run's max_ti"),
+        (["wpc.py --eval-freq 15"], "an even eval_freq"),
+        (["wpc.py", "wbc.py --max-timesteps 10000"], "the same max_timesteps"),
+        (["wpc.py --max-timesteps 7777"], "must divide max_timesteps"),
         ([], "must have runs"),
         (["wpc.py --run-dir a", "wbc.py --run-dir a"], "a --run-dir of its own"),
         (["my_wpc.py"], 'must begin "python wpc.py", .*: python my_wpc.py'),
@@ -232,8 +213,8 @@ def test_what_was_evaluated_is_kept(monkeypatch, tmp_path):
             raise KeyboardInterrupt
 
     class Pool:
-        def submit(self, _, args, dims, actor, *__):
-            actors.append(actor)
+        def submit(self, _, job):
+            actors.append(pickle.loads(job)[1].state_dict())
             future = Stopped() if len(actors) > 2 else Future()
             if len(actors) <= 2:
                 future.set_result({"mean_return": float(len(actors))})
@@ -241,16 +222,16 @@ def test_what_was_evaluated_is_kept(monkeypatch, tmp_path):
 
     context = contextlib.nullcontext(Pool())
     monkeypatch.setattr(together, "ProcessPoolExecutor", lambda *_: context)
-    line = ["together.py", str(tmp_path / "commands.txt"), "--no-compile"]
-    monkeypatch.setattr(sys, "argv", [*line, "--device", "cpu"])
+    line = ["together.py", str(tmp_path / "commands.txt"), "--device", "cpu"]
+    monkeypatch.setattr(sys, "argv", line)
     with pytest.raises(SystemExit, match="what was evaluated is kept"):
         together.main()
     rows = csv.DictReader((tmp_path / "evaluations.csv").open())
     kept = [(row["step"], row["mean_return"]) for row in rows]
     assert kept == [("0", "1.0"), ("10", "2.0")]
     policy = load(tmp_path)["agent"]["actor"]
-    assert all(np.array_equal(x, actors[1][name]) for name, x in policy.items())
-    assert len(actors) > 2 and not np.array_equal(
+    assert all(torch.equal(x, actors[1][name]) for name, x in policy.items())
+    assert len(actors) > 2 and not torch.equal(
         policy["net.4.bias"], actors[2]["net.4.bias"]
     )
 
@@ -273,26 +254,11 @@ def test_environments_of_gymnasium(tmp_path):
 
     pendulum = args("Pendulum-v1", 3)
     runs = together.load([pendulum], "cpu")
-    assert runs.dims == [(3, 1, 2.0)]
-    ((job, _),) = runs.snapshot()
-    assert together.evaluate_run(*job)["mean_return"] < 0
-    with pytest.raises(SystemExit, match="the same bounds"):
+    assert runs.actor.max_action == 2
+    ((job, _, _),) = runs.snapshot()
+    assert together.evaluate_run(pickle.dumps(job))["mean_return"] < 0
+    with pytest.raises(SystemExit, match="must be of one robot"):
         together.load([pendulum, args("MountainCarContinuous-v0", 2)], "cpu")
-
-
-def test_the_random_weight_is_permuted_within_each_run():
-    other_weight = together.weight_of_each_run(["random", "binary", "random", "one"])
-    weight = torch.tensor([0.0, 0.0, 1.0]).repeat(4, 1)[..., None]
-    draws = [other_weight(weight, None, None, None).squeeze(-1) for _ in range(30)]
-    for draw in draws:
-        assert draw[0].sum() == draw[2].sum() == 1
-        assert draw[1].tolist() == [0, 0, 1] and draw[3].tolist() == [1, 1, 1]
-    assert {tuple(draw[0].tolist()) for draw in draws} == {
-        (1, 0, 0),
-        (0, 1, 0),
-        (0, 0, 1),
-    }
-    assert any((draw[0] != draw[2]).any() for draw in draws)
 
 
 def test_each_run_leaves_what_its_script_leaves(tmp_path):
@@ -304,7 +270,7 @@ def test_each_run_leaves_what_its_script_leaves(tmp_path):
     ]
     (tmp_path / "commands.txt").write_text("\n".join(lines))
     line = [sys.executable, ROOT / "tests/tools/together.py"]
-    line += [tmp_path / "commands.txt", "--workers", 1, "--no-compile"]
+    line += [tmp_path / "commands.txt", "--device", "cpu"]
     process = run(*line, cwd=ROOT)
     assert process.returncode == 0, process.stderr
     columns = {}
@@ -330,12 +296,13 @@ def test_each_run_leaves_what_its_script_leaves(tmp_path):
 
     # The policy is the one that was evaluated last, and no script starts anew there.
     checkpoint = load(folder)
-    policy = [{k: x.numpy() for k, x in checkpoint["agent"]["actor"].items()}]
-    policy += [checkpoint["mean"].numpy(), checkpoint["std"].numpy()]
+    actor = wpc.Actor(17, 6, checkpoint["max_action"])
+    actor.load_state_dict(checkpoint["agent"]["actor"])
     args = tyro.cli(wbc.Args, args=shlex.split(lines[-1])[2:])
-    score = together.evaluate_run(args, (17, 6, 1.0), *policy)
+    job = args, actor, checkpoint["mean"], checkpoint["std"]
+    score = together.evaluate_run(pickle.dumps(job))
     assert score["mean_return"] == pytest.approx(float(rows[-1]["mean_return"]))
     before = (folder / "evaluations.csv").read_text()
     process = run(sys.executable, *shlex.split(lines[-1])[1:], cwd=ROOT)
-    assert_one_sentence(process, "was started with another made_by")
+    assert_one_sentence(process, "has another made_by: choose another --run-dir")
     assert (folder / "evaluations.csv").read_text() == before

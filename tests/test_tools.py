@@ -9,7 +9,6 @@ all of Pendulum-v1's are cut off.
 
 import hashlib
 import importlib.util
-import os
 import re
 import runpy
 import shlex
@@ -26,7 +25,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import DATASET, ROOT, assert_one_sentence, run, run_here, wpc
+from conftest import DATASET, ROOT, assert_one_sentence, run, run_here, wpc, wpc_with
 from gymnasium.spaces import Box, Dict, Discrete
 from minari.data_collector import EpisodeBuffer
 from PIL import Image
@@ -121,54 +120,71 @@ def test_the_policy_gives_the_probabilities_that_d4rl_recorded(robot):
     assert ours[unsaturated] == pytest.approx(theirs[unsaturated], abs=0.01)
 
 
-def test_episodes_are_the_same_for_any_number_of_workers(tmp_path, policy, capsys):
-    one = collect(tmp_path / "1.hdf5", 300, policy=policy, workers=1)
-    outputs = [capsys.readouterr().out]
-    two = collect(tmp_path / "2.hdf5", 300, policy=policy, workers=2)
-    outputs.append(capsys.readouterr().out)
-    assert all(np.array_equal(one[key], two[key]) for key in one)
-    digests = [re.search("arrays: ([0-9a-f]{64})\n", x).group(1) for x in outputs]
-    assert digests[0] == digests[1]
+def rows_of(name, steps, seed=0, policy=None):
+    """The columns of so many steps by a policy, or with uniform actions."""
+    env = wpc.make_envs(name, 1).envs[0]
+    args = make_dataset.Args(name, steps, Path("unused"), seed)
+    data = make_dataset.make_columns(steps, env)
+    assert [n for n, _ in make_dataset.collect(args, env, data, policy)][-1] == steps
+    return data
 
 
-def test_rows_follow_from_each_other_in_d4rls_physics(tmp_path, policy):
-    play = make_dataset.play
+def test_rows_follow_from_each_other_in_d4rls_physics(policy):
     policy = make_dataset.load_policy(policy, 11, 3)
-    columns, episode_return = play("hopper", policy, 7, [3])
-    _, actions, rewards, next_states, terminals, timeouts = columns
-    assert terminals.nonzero()[0] == len(terminals) - 1 and not timeouts.any()
-    assert rewards.sum() == pytest.approx(episode_return)
-    assert np.array_equal(columns[0][1:], next_states[:-1])
-    assert all(x.dtype == np.float32 for x in columns[:4])
-
-    rng = np.random.default_rng([7, 3])
+    data = rows_of("hopper", 60, 7, policy)
+    states, next_states = data["observations"], data["next_observations"]
+    over, k = True, -1
     env = wpc.make_envs("hopper", 1).envs[0]
-    state, _ = env.reset(seed=int(rng.integers(2**31)))
-    assert np.array_equal(columns[0][0], np.float32(state))
-    for i, action in enumerate(actions):
-        mean, std = make_dataset.distribution(policy, columns[0][i])
+    for i in range(60):
+        if over:  # each episode has random numbers of its own
+            k += 1
+            rng = np.random.default_rng([7, k])
+            state, _ = env.reset(seed=int(rng.integers(2**31)))
+        assert np.array_equal(states[i], np.float32(state))
+        mean, std = make_dataset.distribution(policy, states[i])
         drawn = np.tanh(mean + std * rng.standard_normal(3))
-        assert action == pytest.approx(drawn, abs=1e-6)
-        state, reward, *_ = env.step(action)
+        assert data["actions"][i] == pytest.approx(drawn, abs=1e-6)
+        state, reward, over, *_ = env.step(data["actions"][i])
         assert np.array_equal(next_states[i], np.float32(state))
-        assert rewards[i] == np.float32(reward)
+        assert data["rewards"][i] == np.float32(reward)
+        assert data["terminals"][i] == over and not data["timeouts"][i]
+    assert k > 1
 
-    again, _ = play("hopper", policy, 7, [2, 3])  # after another episode
-    assert np.array_equal(again[1][-len(actions) :], actions)
-    other_seed, _ = play("hopper", policy, 8, [3])
-    assert not np.array_equal(other_seed[0][0], columns[0][0])
-    uniform, _ = play("hopper", None, 7, range(20))
-    assert np.histogram(uniform[1], 4, (-1, 1))[0] / uniform[1].size == pytest.approx(
-        [0.25] * 4, abs=0.05
-    )
+    other_seed = rows_of("hopper", 1, 8, policy)
+    assert not np.array_equal(other_seed["observations"][0], states[0])
+    uniform = rows_of("hopper", 500)["actions"]
+    shares = np.histogram(uniform, 4, (-1, 1))[0] / uniform.size
+    assert shares == pytest.approx([0.25] * 4, abs=0.05)
+
+
+def test_an_end_by_both_is_no_timeout():
+    for terminal, truncated in ((True, True), (False, True), (True, False)):
+        results = np.ones(2), 0.5, terminal, truncated, {}
+        env = SimpleNamespace(step=lambda action, results=results: results)
+        data = make_dataset.make_columns(2, Delayed)
+        _, reward, over = make_dataset.do_step(env, np.zeros(2), np.zeros(1), data, 1)
+        assert reward == 0.5 and over
+        assert data["terminals"].tolist() == [False, terminal]
+        assert data["timeouts"].tolist() == [False, not terminal]
+        assert data["next_observations"].tolist() == [[0, 0], [1, 1]]
+
+
+def test_the_last_episodes_return():
+    env = wpc.make_envs("hopper", 1).envs[0]
+    args = make_dataset.Args("hopper", 200, Path("unused"))
+    data = make_dataset.make_columns(200, env)
+    returns = [x for _, x in make_dataset.collect(args, env, data)]
+    end, *_ = data["terminals"].nonzero()[0]
+    assert np.isnan(returns[: end + 1]).all()
+    assert returns[end + 1] == pytest.approx(data["rewards"][: end + 1].sum())
 
 
 def test_actions_reach_the_bounds():
     zeros = np.zeros((256, 256)), np.zeros(256)
     w, b = np.zeros((1, 256)), np.full(1, 100.0)
     policy = [(np.zeros((256, 3)), zeros[1]), zeros, (w, b), (w, -b)]
-    columns, _ = make_dataset.play("Pendulum-v1", policy, 0, [0])
-    assert (columns[1] == 2).all() and columns[5].nonzero()[0] == 199
+    data = rows_of("Pendulum-v1", 300, 0, policy)
+    assert (data["actions"] == 2).all() and data["timeouts"].nonzero()[0] == 199
     policy = [*policy[:3], (w, b)]
     mean, std = make_dataset.distribution(policy, np.zeros(3))
     assert mean == 100 and std == pytest.approx(np.exp(2))  # as D4RL's SAC
@@ -176,7 +192,7 @@ def test_actions_reach_the_bounds():
 
 def test_the_file_is_cut_off_at_its_last_step(tmp_path, capsys):
     path = tmp_path / "random data.hdf5"
-    data = collect(path, 100, random=True, workers=1)
+    data = collect(path, 100, random=True)
     assert {len(column) for column in data.values()} == {100}
     assert data["timeouts"].nonzero()[0].tolist() == [99] and not data["terminals"][99]
     output = capsys.readouterr().out
@@ -197,7 +213,6 @@ def test_the_file_is_cut_off_at_its_last_step(tmp_path, capsys):
     "options, sentence",
     [
         ({"steps": 0}, "must be >= 1"),
-        ({"workers": 0}, "must be >= 1"),
         ({"policy": Path("policy.npz"), "random": True}, "exclude each other"),
     ],
 )
@@ -223,24 +238,20 @@ class Delayed(gym.Env):
         return np.array([9, 9]), -((self.first - 1.5) ** 2), True, False, {}
 
 
-def learn(steps, seed=0, **options):
+def learn(steps, seed=0, random_steps=80):
     """What SAC meets in this environment, and each step's last return."""
-    args = make_dataset.Args("Delayed", steps, Path("unused"), seed=seed, **options)
-    data = {
-        "observations": np.zeros((steps, 2), np.float32),
-        "actions": np.zeros((steps, 1), np.float32),
-        "rewards": np.zeros(steps, np.float32),
-        "next_observations": np.zeros((steps, 2), np.float32),
-        "terminals": np.zeros(steps, bool),
-        "timeouts": np.zeros(steps, bool),
-    }
+    args = make_dataset.Args("Delayed", steps, Path("unused"), seed)
+    args.random_steps = random_steps
+    data = make_dataset.make_columns(steps, Delayed)
     returns = [last for _, last in make_dataset.learn(args, Delayed(), data)]
     return data, returns
 
 
-def test_sac_learns():
+def test_sac_learns(monkeypatch):
     """To begin with 1.5, which pays best, where uniform actions average 0."""
-    data, returns = learn(400, random_steps=80, lr=3e-3, tau=0.05, batch_size=64)
+    for name, fast in (("LEARNING_RATE", 3e-3), ("TAU", 0.05), ("BATCH_SIZE", 64)):
+        monkeypatch.setattr(make_dataset, name, fast)
+    data, returns = learn(400)
     space = Box(-2, 2, (1,), seed=0)
     assert data["actions"][:80].tolist() == [space.sample() for _ in range(80)]
     assert data["actions"][80] != space.sample()
@@ -293,22 +304,29 @@ class Stop:
 def test_ctrl_c_writes_what_sac_met(tmp_path, capsys, monkeypatch):
     path = tmp_path / "made.hdf5"
     args = make_dataset.Args("Pendulum-v1", 1000, path, random_steps=20)
-    make_env = make_dataset.make_env
-    monkeypatch.setattr(make_dataset, "make_env", lambda env: Stop(make_env(env), 30))
+    make_envs = wpc.make_envs
+
+    def stop(*arguments):
+        def make_stopping(name, count):
+            env = make_envs(name, count).envs[0]
+            return SimpleNamespace(envs=[Stop(env, *arguments)])
+
+        monkeypatch.setattr(wpc, "make_envs", make_stopping)
+
+    stop(30)
     make_dataset.main(args)
     data = read(path)
     assert {len(column) for column in data.values()} == {30}
     assert data["timeouts"][-1] and np.abs(data["observations"]).min() > 0
     assert "30 transitions in 1 episodes" in capsys.readouterr().out
 
-    crash = make_env("Pendulum-v1"), 31, ValueError
-    monkeypatch.setattr(make_dataset, "make_env", lambda env: Stop(*crash))
+    stop(31, ValueError)
     with pytest.raises(ValueError):
         make_dataset.main(args)
     assert len(read(path)["rewards"]) == 31
 
     path.unlink()
-    monkeypatch.setattr(make_dataset, "make_env", lambda env: Stop(make_env(env), 0))
+    stop(0)
     assert refusal_of(make_dataset.main, args) == "nothing was collected"
     assert not path.exists()
 
@@ -322,38 +340,24 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # also where it is ign
 def stopped(*arguments):
     for i, progress in enumerate(collect(*arguments)):
         yield progress
-        if i == 2:
-            os.killpg(os.getpid(), signal.SIGNAL)  # as a terminal or a cluster does
+        if i == 299:
+            os.kill(os.getpid(), signal.SIGNAL)
 make_dataset.collect = stopped
 make_dataset.main(make_dataset.Args("hopper", 100000, sys.argv[1], random=True))
 """
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_a_signal_writes_what_the_workers_collected(tmp_path, name):
+def test_a_signal_writes_what_was_collected(tmp_path, name):
     path = tmp_path / "made.hdf5"
     line = INTERRUPTED.replace(
         "sys.argv[1]", f"__import__('pathlib').Path({str(path)!r})"
     ).replace("SIGNAL", name)
-    process = run(sys.executable, "-c", line, cwd=ROOT, start_new_session=True)
+    process = run(sys.executable, "-c", line, cwd=ROOT)
     assert process.returncode == 0 and process.stderr == "", process.stderr
     data = read(path)
-    (columns, _) = make_dataset.play("hopper", None, 0, range(15))  # of three tasks
-    for ours, expected in zip(data.values(), columns, strict=True):
-        assert len(ours) == len(expected)
-    assert np.array_equal(data["actions"], columns[1])
-
-
-def test_the_workers_are_as_many_as_there_are_cpus_to_use(monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 64)
-    monkeypatch.setattr(os, "process_cpu_count", lambda: 3, raising=False)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {5, 7}, raising=False)
-    options = {"env": "hopper", "steps": 9, "out": Path("x")}
-    assert make_dataset.Args(**options).workers == 3
-    monkeypatch.delattr(os, "process_cpu_count")
-    assert make_dataset.Args(**options).workers == 2
-    monkeypatch.delattr(os, "sched_getaffinity")
-    assert make_dataset.Args(**options).workers == 64
+    assert all(len(column) == 300 for column in data.values())
+    assert np.array_equal(data["actions"], rows_of("hopper", 300)["actions"])
 
 
 NO_POLICY = [
@@ -422,7 +426,7 @@ def test_environments_that_the_scripts_can_not_use(tmp_path):
 
 
 def test_out_is_tried_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr(make_dataset, "make_env", None)
+    monkeypatch.setattr(wpc, "make_envs", None)
     monkeypatch.setattr(from_minari, "open_dataset", None)
     out = tmp_path / "nofolder/made.hdf5"
     args = make_dataset.Args("hopper", 10, out, random=True)
@@ -489,9 +493,9 @@ def make(tmp_path, monkeypatch):
 
 def assert_nothing_is_lost(path, dataset, state_dim, action_dim):
     """The scripts make Minari's transitions of the file, and know its episodes."""
-    args = wpc.Args(weight="static")
     arrays = wpc.read_dataset(path, state_dim, action_dim, 2.0)
-    data, mean, std, _ = wpc.prepare_dataset(arrays, args)
+    static = wpc_with("static")
+    data, mean, std, _ = static.prepare_dataset(arrays, static.Args())
     for key in ("observations", "next_observations"):
         data[key] = data[key] * std + mean
     keys = ("observations", "actions", "rewards", "next_observations", "terminals")
@@ -970,6 +974,7 @@ def save_run(folder, env, state_dim, action_dim, max_action=1.0):
         "mean": mean,
         "std": std,
         "max_action": max_action,
+        "evaluations": [{"step": 0}, {"step": 5_000}],
     }
     torch.save(checkpoint, folder / "checkpoint.pt")
     return actor, mean, std
@@ -1001,7 +1006,7 @@ def hopper_run(tmp_path, monkeypatch):
 
 def test_the_film_is_of_the_run(hopper_run, capsys):
     folder, actor, mean, std = hopper_run
-    play.main(play.Args(folder, folder / "policy.gif", seed=5, size=60))
+    play.main(play.Args([folder], folder / "policy.gif", seed=5, size=60))
     env = wpc.make_envs("hopper", 1).envs[0]
     state, _ = env.reset(seed=5)
     episode_return, steps, over = 0.0, 0, False
@@ -1012,29 +1017,66 @@ def test_the_film_is_of_the_run(hopper_run, capsys):
         episode_return += reward
         steps, over = steps + 1, terminated or truncated
     score = 100 * (episode_return + 20.272305) / (3234.3 + 20.272305)
-    expected = f"{steps} steps, return {episode_return:.1f}, D4RL's score {score:.1f}"
+    expected = f"{steps} steps, return {episode_return:.0f}; D4RL's score {score:.1f}"
     assert expected in capsys.readouterr().out
     with Image.open(folder / "policy.gif") as film:
-        assert film.size == (60, 60) and film.n_frames == -(-steps // 5)  # 125 fps
+        assert film.size == (60, 60) and film.n_frames == 1 - (-steps // 5)  # 125 fps
         assert film.info["duration"] == 40 and "loop" in film.info
 
 
-def test_frames_as_files(hopper_run):
-    folder = hopper_run[0]
-    play.main(play.Args(folder, folder / "frames", frames=3, size=60))
-    names = sorted(x.name for x in (folder / "frames").iterdir())
-    assert names == ["0000.png", "0001.png", "0002.png"]
-    pictures = [np.array(Image.open(folder / "frames" / name)) for name in names]
-    assert pictures[0].shape == (60, 60, 3) and np.ptp(pictures[0]) > 100
-    assert not np.array_equal(pictures[0], pictures[2])
-    play.main(play.Args(folder, folder / "frames/f%02d.png", frames=1, size=60))
-    assert (folder / "frames/f00.png").exists()
-    play.main(play.Args(folder, folder / "50%/frames", frames=1, size=60))
-    assert (folder / "50%/frames/0000.png").exists()
+def test_what_stands_in_the_picture(hopper_run, monkeypatch):
+    """Also where --frames ends the film before the episode does."""
+    folder, texts = hopper_run[0], []
+
+    def picture(env, size, text, dimmed=False):
+        start = f"{folder.name}\n5,000 training steps, seed 0\n"
+        texts.append((text.removeprefix(start), dimmed))
+
+    monkeypatch.setattr(play, "picture", picture)
+    args = play.Args([folder], folder / "policy.gif", seed=5)
+    images, fps = play.film(folder, args)
+    assert fps == 25 and len(images) == len(texts)
+    assert texts[0] == ("step 0, return 0", False)
+    assert re.fullmatch(r"ended: \d+ steps, return \d+", texts[-1][0])
+    assert [dimmed for _, dimmed in texts] == [False] * (len(texts) - 1) + [True]
+    texts.clear()
+    args.frames = 2
+    assert len(play.film(folder, args)[0]) == 2
+    assert texts[-1][0].startswith("step 5, ")
+
+
+def test_shorter_films_wait_for_the_longest(tmp_path):
+    """Side by side in the given order; the last frame stays for three seconds."""
+    grey = [Image.new("RGB", (8, 8), (x, x, x)) for x in (0, 50, 100, 150, 200)]
+    play.write(tmp_path / "x.gif", [grey[:2], grey[2:]], fps=20)
+    with Image.open(tmp_path / "x.gif") as film:
+        shown = []
+        for i in range(film.n_frames):
+            film.seek(i)
+            picture = film.convert("L")
+            shown.append((picture.getpixel((1, 1)), picture.getpixel((15, 7))))
+            assert film.info["duration"] == (3000 if i == 2 else 50)
+    assert film.size == (16, 8) and shown == [(0, 100), (50, 150), (50, 200)]
+
+
+def test_a_picture_has_its_text_and_is_dimmed():
+    env = SimpleNamespace(render=lambda: np.full((9, 9, 3), 100, np.uint8))
+    bright, dim = play.picture(env, 180, "text"), play.picture(env, 180, "text", True)
+    for image, level in ((bright, 100), (dim, 50)):
+        pixels = np.asarray(image)
+        assert pixels.shape == (180, 180, 3) and (pixels[90:] == level).all()
+        assert pixels[:30].max() > 230
+
+
+def test_runs_of_environments_of_another_speed(tmp_path, monkeypatch):
+    fps = iter((10, 20))
+    monkeypatch.setattr(play, "film", lambda *_: ([], next(fps)))
+    args = play.Args([tmp_path, tmp_path], tmp_path / "x.gif")
+    assert "the same render_fps" in refusal_of(play.main, args)
 
 
 def test_the_camera_follows_the_robot(hopper_run):
-    args = play.Args(hopper_run[0], hopper_run[0], seed=5)
+    args = play.Args([hopper_run[0]], Path("policy.gif"), seed=5)
     env, observation = play.start(args, "hopper")
     assert np.array_equal(observation, gym.make("Hopper-v5").reset(seed=5)[0])
     env.unwrapped.data.qpos[0] += 20
@@ -1054,67 +1096,41 @@ def test_a_missing_graphics_library(tmp_path):
     assert_one_sentence(process, "MuJoCo needs EGL or OSMesa (on Debian, apt install")
 
 
-def film(tmp_path, monkeypatch, name):
-    """play.py's main with an environment of two steps, whose pictures are grey."""
-
-    class Grey(Delayed):
-        spec = SimpleNamespace(max_episode_steps=3)
-
-        def render(self):
-            return np.full((4, 4, 3), 99, np.uint8)
-
-    save_run(tmp_path, "Grey-v0", 2, 1)
-    observation, _ = (env := Grey()).reset()
-    monkeypatch.setattr(play, "start", lambda *_: (env, observation))
-    play.main(play.Args(tmp_path, tmp_path / name, size=16))
-
-
-def test_an_mp4(tmp_path, monkeypatch):
-    monkeypatch.setattr(play.importlib.util, "find_spec", lambda name: name)
-    films = []
-
-    def write(path, pictures, fps):
-        films.append((path, np.shape(pictures), fps))
-
-    monkeypatch.setattr(play.imageio, "mimsave", write)
-    film(tmp_path, monkeypatch, "policy.mp4")
-    assert films == [(tmp_path / "policy.mp4", (2, 16, 16, 3), 30)]
-
-
 def test_a_full_disk_while_a_film_is_written(tmp_path, monkeypatch):
     def save(*_, **__):
         raise OSError(28, "No space left on device")
 
+    monkeypatch.setattr(play, "film", lambda *_: ([Image.new("RGB", (8, 8))], 30))
     monkeypatch.setattr(Image.Image, "save", save)
-    with pytest.raises(SystemExit, match=r"policy.gif can't be written: \[Errno 28\]"):
-        film(tmp_path, monkeypatch, "policy.gif")
+    args = play.Args([tmp_path], tmp_path / "policy.gif")
+    sentence = refusal_of(play.main, args)
+    assert "policy.gif can't be written: [Errno 28]" in sentence
 
 
-NO_FILM = [
-    ("policy.mov", "must end in .gif, .mp4 or %04d.png, or be a folder"),
-    ("policy.png", "must end in .gif, .mp4 or %04d.png, or be a folder"),
-    ("100%.png", "must end in .gif, .mp4 or %04d.png, or be a folder"),
-    ("policy%d.gif", "must end in .gif, .mp4 or %04d.png, or be a folder"),
-    ("nofolder/policy.gif", "--out can't be written: [Errno 2]"),
-    ("checkpoint.pt/x/%d.png", "--out can't be written: [Errno 20]"),
-    ("policy.mp4", "pip install imageio-ffmpeg"),
-    ("policy.gif", "Unfilmed-v0 can't be filmed ("),
-]
 gym.register("Unfilmed-v0", PENDULUM, max_episode_steps=9, kwargs={"unknown": 1})
 
 
-@pytest.mark.parametrize("out, sentence", NO_FILM)
-def test_films_that_can_not_be_made(tmp_path, monkeypatch, out, sentence):
-    monkeypatch.setattr(play.importlib.util, "find_spec", lambda name: None)
+def test_films_that_can_not_be_made(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
     save_run(tmp_path, "Unfilmed-v0", 3, 1)
-    refusal = refusal_of(play.main, play.Args(tmp_path, tmp_path / out))
-    assert sentence in refusal and "MuJoCo" not in refusal
-    assert [x.name for x in tmp_path.iterdir()] == ["checkpoint.pt"]
+    for out, sentence in (
+        ("nofolder/policy.gif", "--out can't be written: [Errno 2]"),
+        ("policy.gif", "Unfilmed-v0 can't be filmed ("),
+    ):
+        refusal = refusal_of(play.main, play.Args([tmp_path], tmp_path / out))
+        assert sentence in refusal and "MuJoCo" not in refusal
+        assert [x.name for x in tmp_path.iterdir()] == ["checkpoint.pt"]
+    for wrong, sentence in (
+        ({"out": Path("policy.mp4")}, "policy.mp4 must end in .gif"),
+        ({"run_dirs": []}, "name a run"),
+        ({"fps": 0}, "must be >= 1"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            play.Args(**{"run_dirs": [tmp_path], "out": Path("x.gif")} | wrong)
 
 
 def test_films_of_what_is_no_run(tmp_path):
-    args, sentences = play.Args(tmp_path, tmp_path / "policy.gif"), []
+    args, sentences = play.Args([tmp_path], tmp_path / "policy.gif"), []
     sentences.append(refusal_of(play.main, args))
     (tmp_path / "checkpoint.pt").write_bytes(b"nonsense")
     sentences.append(refusal_of(play.main, args))
@@ -1206,15 +1222,20 @@ def test_what_is_no_file_of_td3_bc(tmp_path, float64):
 TEST_SET = ROOT / "tests/data/minari/test/pendulum-v0"
 
 
-@pytest.mark.parametrize("tool", ["check_physics", "from_minari"])
+@pytest.mark.parametrize(
+    "tool", ["check_physics", "from_minari", "make_dataset", "join"]
+)
 def test_what_the_scripts_refuse_is_a_tools_sentence_too(monkeypatch, tmp_path, tool):
-    def refuse(*_):
+    def refuse(*_, **__):
         raise wpc.UserError("a sentence")
 
     monkeypatch.setattr(wpc, "make_envs", refuse)
+    monkeypatch.setattr(wpc, "read_dataset", refuse)
     line = {
         "check_physics": [DATASET, "--env", "halfcheetah"],
         "from_minari": [TEST_SET, "--env", "ShortPendulum-v0", "--out", tmp_path / "x"],
+        "make_dataset": ["--env", "hopper", "--steps", 9, "--out", tmp_path / "x"],
+        "join": [DATASET, "--out", tmp_path / "x"],
     }[tool]
     monkeypatch.setattr(sys, "argv", [tool, *map(str, line)])
     with pytest.raises(SystemExit, match="a sentence"):

@@ -13,6 +13,7 @@ run folder below --runs, whatever its name.
 """
 
 import csv
+import functools
 import importlib
 import itertools
 import json
@@ -61,12 +62,6 @@ SYSTEMS = {
     "wPC-e": ("#CC79A7", (0, (6, 1, 1, 1, 1, 1))),
     "wPC-rnd": ("#56B4E9", ":"),
     "static weight": ("#D55E00", (0, (8, 2))),
-}
-OUR_DATA = {
-    "random": "of uniform actions",
-    "medium": "of D4RL's policy",
-    "medium-replay": "of our SAC agent (D4RL: 202,000, 402,000 and 302,000)",
-    "medium-expert": "of D4RL's medium policy and an expert that is not D4RL's",
 }
 COMPARED = ["wPC", "TD3+BC", "wBC"]
 OF_WEIGHTS = {"exponential": "wPC-e", "random": "wPC-rnd", "static": "static weight"}
@@ -142,6 +137,10 @@ class Group:
     def size(self):
         return f"{len(self.scores)}; {self.steps[-1] / 1000:,g}k"
 
+    @property
+    def score(self):
+        return f"{mean_and_std(self.last_ten())} ({self.size})"
+
 
 def read_run(folder):
     """What the report needs of a run; a ValueError says why it is of no use."""
@@ -173,6 +172,8 @@ def read_run(folder):
     defaults = vars(importlib.import_module(script).Args(env=env, dataset="-"))
     if system == "BC":
         defaults["alpha"] = 0
+    if system == "wPC":
+        defaults["weight"] = "binary"
     others = ", ".join(
         f"{name} {args[name]}"
         for name, default in defaults.items()
@@ -182,48 +183,48 @@ def read_run(folder):
     return run | {"seed": args["seed"], "alpha": args.get("alpha")}
 
 
-def read_groups(folder):
-    """The groups of runs by (task, system, other arguments), in the paper's order.
+def read_runs(folder):
+    """The runs by (task, system, other arguments) and seed, the longest of each seed.
     Says on stdout what does not count, and why."""
-    runs, groups = {}, {}
+    runs, by_key = [], {}
     for path in sorted(folder.rglob("evaluations.csv")):
         try:
-            run = read_run(path.parent)
+            runs.append(read_run(path.parent))
         except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
             print(f"passed over: {path.parent} ({type(error).__name__}: {error})")
-            continue
-        seeds = runs.setdefault(run["key"], {})
-        pair = [seeds.get(run["seed"], run), run]
-        short, long = sorted(pair, key=lambda run: run["step"][-1])
-        seeds[run["seed"]] = long
-        if short is not long:
-            print(f"passed over: {short['folder']} ({long['folder']} is of its seed)")
+    for run in sorted(runs, key=lambda run: -run["step"][-1]):
+        kept = by_key.setdefault(run["key"], {}).setdefault(run["seed"], run)
+        if kept is not run:
+            print(f"passed over: {run['folder']} ({kept['folder']} is of its seed)")
+    return by_key
 
-    def in_order(key):
-        task, system, others = key
+
+def read_groups(folder):
+    """The groups of runs by (task, system, other arguments), in the paper's order."""
+
+    def in_order(item):
+        task, system, others = item[0]
         place = TASKS.index(task) if task in TASKS else len(TASKS)
         return place, task, list(SYSTEMS).index(system), others
 
-    for key in sorted(runs, key=in_order):
-        seeds = [runs[key][seed] for seed in sorted(runs[key])]
-        data = {f"{run['best_discounted_return'][-1]:.1f}" for run in seeds}
-        if len(data) > 1:
+    groups = {}
+    for key, seeds in sorted(read_runs(folder).items(), key=in_order):
+        runs = [seeds[seed] for seed in sorted(seeds)]
+        data = {f"{run['best_discounted_return'][-1]:.1f}" for run in runs}
+        steps = functools.reduce(np.intersect1d, [run["step"] for run in runs])
+        if len(data) > 1 or len(steps) < 10:
             best = " and ".join(sorted(data))
-            print(f"passed over: {key} (different data, with best returns {best})")
+            print(
+                f"passed over: {key} (its runs share {len(steps)} evaluations, on data "
+                f"with best returns of {best})"
+            )
             continue
-        steps = sorted(set.intersection(*(set(run["step"]) for run in seeds)))
-        longest = max(run["step"][-1] for run in seeds)
-        if len(steps) < 10:
-            print(f"passed over: {key} (its runs share {len(steps)} evaluations)")
-            continue
-        if longest > steps[-1]:
-            print(f"{key} counts to step {steps[-1]:,.0f}, not to {longest:,.0f}")
         scores, q = (
-            np.stack([run[name][np.isin(run["step"], steps)] for run in seeds])
+            np.stack([run[name][np.isin(run["step"], steps)] for run in runs])
             for name in ("score", "q")
         )
-        alpha, best_return = seeds[0]["alpha"], seeds[0]["best_discounted_return"][-1]
-        groups[key] = Group(*key, alpha, best_return, np.array(steps), scores, q)
+        alpha, best_return = runs[0]["alpha"], runs[0]["best_discounted_return"][-1]
+        groups[key] = Group(*key, alpha, best_return, steps, scores, q)
     return groups
 
 
@@ -242,34 +243,32 @@ def mean_and_std(values):
 
 def published(source, task):
     """A score such as the one of "wPC, paper"; "-" if there is none."""
-    scores = PUBLISHED.get(source, "").split()
-    return scores[TASKS.index(task)] if scores and task in TASKS else "-"
+    scores = dict(zip(TASKS, PUBLISHED.get(source, "").split(), strict=False))
+    return scores.get(task, "-")
+
+
+def scores_of_data(groups):
+    """By task, the mean score of the episodes trained on, if datasets.csv has them."""
+    best = {group.task: group.data for group in groups.values() if not group.others}
+    with (ROOT / "tests/results/datasets.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    rows = [row for row in rows if best.get(row["task"]) == row["best_return"]]
+    return {row["task"]: row["mean_score"] for row in rows}
 
 
 def score_table(groups, tasks, systems):
     """Our scores, and beside them those that were published."""
-    path = ROOT / "tests/results/datasets.csv"
-    data = list(csv.DictReader(path.open())) if path.exists() else []
-    data = {(row["task"], row["best_return"]): row for row in data}
-    best = {x.task: x.data for x in groups.values() if not x.others}
-    data = {task: data.get((task, best.get(task))) for task in tasks}
-    header = ["task", "the data"]
-    rows = [[task, data[task]["mean_score"] if data[task] else "-"] for task in tasks]
+    header, rows, data = ["task", "the data"], [], scores_of_data(groups)
     for system in systems:
-        sources = [source for source in PUBLISHED if source.startswith(f"{system},")]
-        header += [system, *sources]
-        for row in rows:
-            group = groups.get((row[0], system, ""))
-            ours = f"{mean_and_std(group.last_ten())} ({group.size})" if group else "-"
-            row += [ours, *(published(source, row[0]) for source in sources)]
-    for row, known in zip(rows, data.values(), strict=True):
-        kind = row[0].partition("-")[2]
-        row.append(
-            f"{int(known['transitions']):,}, {OUR_DATA.get(kind, 'own')}"
-            if known
-            else "-"
-        )
-    return markdown([*header, "whose data"], rows)
+        header.append(system)
+        header += [source for source in PUBLISHED if source.startswith(f"{system},")]
+    for task in tasks:
+        row = [task, data.get(task, "-")]
+        for name in header[2:]:
+            group = groups.get((task, name, ""))
+            row.append(group.score if group else published(name, task))
+        rows.append(row)
+    return markdown(header, rows)
 
 
 def difference(group, other):
@@ -297,22 +296,6 @@ def difference_table(groups, tasks, systems):
     return markdown(["task", *(f"{first} - {other}" for other in others)], rows)
 
 
-def totals_table(groups, systems):
-    """Sums over the tasks of Table 1 that a system has runs on, ours and published."""
-    rows = []
-    for system in systems:
-        tasks = [task for task in TASKS if (task, system, "") in groups]
-        ours = sum(groups[task, system, ""].last_ten().mean() for task in tasks)
-        row = [system, str(len(tasks)), f"{ours:.1f}"]
-        for source, summed in (("paper", tasks), ("CORL", tasks), ("paper", TASKS)):
-            scores = [published(f"{system}, {source}", task) for task in summed]
-            row.append("-" if "-" in scores else f"{sum(map(float, scores)):.1f}")
-        if tasks:
-            rows.append(row)
-    header = ["system", "tasks", "these runs", "paper", "CORL", "paper, all twelve"]
-    return markdown(header, rows)
-
-
 def span(values, form):
     low, high = format(min(values), form), format(max(values), form)
     return low if low == high else f"{low} to {high}"
@@ -335,6 +318,14 @@ def q_table(groups):
         row += [str(over.sum()), str((over & (end < 1)).sum())]
         rows.append([*row, mean_and_std(group.last_ten())])
     return markdown(header, rows)
+
+
+def published_curve(task):
+    """Others' evaluations of TD3+BC on D4RL's own file of a task; empty for others."""
+    path = ROOT / "tests/results/td3_bc_on_d4rl.csv"
+    options = {"delimiter": ",", "dtype": None, "encoding": "utf-8"}
+    curves = np.genfromtxt(path, names=True, skip_header=4, **options)
+    return curves[curves["task"] == task]
 
 
 def reproduction_table(pairs):
@@ -375,31 +366,6 @@ def panel(groups, task, systems, column):
     return task, "score (dotted: the paper's)", curves, levels
 
 
-def runaway_panels(groups):
-    """Q and scores of wPC on the tasks that have runs of several alphas."""
-    tasks = {}
-    for group in groups.values():
-        of_alpha = group.system == "wPC" and re.fullmatch(r"(alpha \S+)?", group.others)
-        if of_alpha and group.best_return > 0:
-            tasks.setdefault(group.task, []).append(group)
-    tasks = {task: shown for task, shown in tasks.items() if len(shown) > 1}
-    alphas = sorted({x.alpha for shown in tasks.values() for x in shown}, reverse=True)
-    styles = dict(zip(alphas, itertools.cycle(SYSTEMS.values()), strict=False))
-    panels = []
-    for ylabel, levels in (
-        ("Q / best return in the data", [(1, "black", "--")]),
-        ("score", []),
-    ):
-        for task, shown in tasks.items():
-            curves = []
-            for group in sorted(shown, key=lambda group: -group.alpha):
-                x = group.scores if ylabel == "score" else group.q / group.best_return
-                style = styles[group.alpha]
-                curves.append((f"alpha {group.alpha}", style, group.steps, band(x)))
-            panels.append((task, ylabel, curves, levels))
-    return panels
-
-
 def reproduction_panel(group, curve):
     theirs = curve["step"], [curve[name] for name in ("min", "mean", "max")]
     curves = [("on D4RL's own files (five seeds)", ("#555555", "-"), *theirs)]
@@ -429,9 +395,6 @@ def draw(path, panels):
         axis.autoscale_view()
         axis.set(title=title, xlabel="training steps (thousands)", ylabel=ylabel)
         axis.grid(alpha=0.3)
-        if not curves:
-            axis.text(0.5, 0.5, "no run yet", ha="center", transform=axis.transAxes)
-            axis.set(xticks=[], yticks=[], xlabel=None, ylabel=None)
     for axis in axes.flat[len(panels) :]:
         axis.remove()
     figure.legend(
@@ -453,17 +416,13 @@ INTRODUCTION = """\
 Scores are D4RL's normalized ones, or returns where a task is called "(mean return)". A
 score is the mean of a run's last ten evaluations; over seeds: mean ± sample standard
 deviation (seeds; training steps). What the paper and CORL have published is of D4RL's
-own files. "The data" is the mean score of the episodes trained on and "whose data" the
-number of transitions and whom they are of, where the report knows them
-(tests/results/datasets.csv). Runs whose arguments, other than --weight, differ from the
-scripts' defaults are in the table on Q alone.
+own files. "The data" is the mean score of the episodes trained on, where the report
+knows them (tests/results/datasets.csv); whose they are is in tests/results/README.md.
+Runs whose arguments differ from the scripts' defaults are in the table on Q alone.
 """
 NOTES = {
     "Differences": "Mean, 95% interval and p of Welch's t test, not corrected for "
     "the number of tests (seeds of each; steps).",
-    "Totals": "Over the tasks of Table 1 on which a system has runs here, which are "
-    "not the same for all systems; beside them what is published for the same tasks. "
-    "(Of all twelve, the paper prints 711.4 for wBC, but its scores add up to 712.7.)",
     "When does Q run away?": "Q (its mean over a batch) divided by the best discounted "
     "return-to-go of the data, from the lowest to the highest seed: the mean "
     "of the last ten evaluations, the largest and its step; how many seeds had it over "
@@ -490,13 +449,9 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
         count = {t: sum((t, s, "") in groups for s in systems) for t in tasks}
         return [task for task in tasks if count[task] >= at_least]
 
-    path = ROOT / "tests/results/td3_bc_on_d4rl.csv"
-    options = {"delimiter": ",", "dtype": None, "encoding": "utf-8"}
-    on_d4rl = np.genfromtxt(path, names=True, skip_header=4, **options)
     td3_bc = (groups[task, "TD3+BC", ""] for task in tasks_of("TD3+BC"))
-    pairs = [(group, on_d4rl[on_d4rl["task"] == group.task]) for group in td3_bc]
+    pairs = [(group, published_curve(group.task)) for group in td3_bc]
     pairs = [pair for pair in pairs if np.isin(pair[0].steps, pair[1]["step"]).any()]
-
     all_tasks = tasks_of(*COMPARED, "BC")
     if set(all_tasks) & set(TASKS):
         all_tasks = list(dict.fromkeys([*TASKS, *all_tasks]))
@@ -504,7 +459,6 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
     others = tasks_of(*OF_WEIGHTS.values())
     tables = {
         "Table 1": score_table(groups, all_tasks, table_1),
-        "Totals": totals_table(groups, table_1),
         "Differences": difference_table(groups, tasks_of(*COMPARED), COMPARED),
         "Other weights (Table 2, Figure 4)": score_table(groups, others, weights),
         "Differences to other weights": difference_table(
@@ -527,15 +481,14 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
 
     static = tasks_of("static weight")
     figures = {
-        "figure2": panels(all_tasks, COMPARED, "scores"),
+        "figure2": panels(tasks_of(*COMPARED), COMPARED, "scores"),
         "figure3": panels(tasks_of(*COMPARED, at_least=2), COMPARED, "q"),
         "figure4": panels(static, ["wPC", "static weight"], "q", "scores"),
         "figure5": panels(tasks_of("wPC-e", "wPC-rnd"), weights[:4], "scores"),
-        "runaway": runaway_panels(groups),
         "reproduction": [reproduction_panel(*pair) for pair in pairs],
     }
     for name, drawn in figures.items():
-        if any(curves for _, _, curves, _ in drawn):
+        if drawn:
             draw(out / f"{name}.png", drawn)
 
 

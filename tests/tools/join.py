@@ -21,8 +21,7 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from make_dataset import reason, try_to_write, write_or_exit
 
-NEEDED = ("observations", "actions", "rewards", "terminals", "timeouts")
-FLAGS = ("terminals", "timeouts")
+import wpc
 
 
 @dataclass
@@ -38,38 +37,23 @@ class Args:
 
 
 def read(path):
-    """A file's columns by name, with an end at the last row, and the unread names.
-
-    Exits with a sentence if the file is not in D4RL's format.
-    """
-    columns = {}
+    """A file's columns by name, with an end at the last row."""
     try:
         with h5py.File(path) as file:
-            names = set(file)
-            for name in (*NEEDED, "next_observations"):
-                if name in names:
-                    columns[name] = np.float32(file[name][:])
+            widths = [file[name].shape[-1] for name in ("observations", "actions")]
     except Exception as error:  # of several types where a file is damaged
         sys.exit(f"{path} can't be read ({reason(error)})")
-    if missing := [name for name in NEEDED if name not in columns]:
-        sys.exit(f"{path} has no {', '.join(missing)}, which D4RL's format needs")
-
-    rows = len(columns["observations"])
-    for name, column in columns.items():
-        width = column.size // max(rows, 1)
-        is_flat = name in ("rewards", *FLAGS)
-        if not rows or column.size != rows * width or (is_flat and width != 1):
-            sys.exit(
-                f"{path}: {name} has shape {column.shape}, where observations has "
-                f"{rows:,} rows; each column needs as many, and at least one"
-            )
-        columns[name] = column.reshape(rows) if is_flat else column.reshape(rows, width)
-    for name in FLAGS:
-        if not np.isin(columns[name], (0, 1)).all():
-            sys.exit(f"{path}: {name} must be 0 or 1 in each row")
+    columns = wpc.read_dataset(path, *widths, max_action=np.inf)
+    if not len(columns["rewards"]):
+        sys.exit(f"{path} has no rows")
+    for name in ("terminals", "timeouts"):
         columns[name] = columns[name].astype(bool)
-    columns["timeouts"][-1] |= not columns["terminals"][-1]
-    return columns, names - columns.keys()
+    columns["timeouts"][-1] |= ~columns["terminals"][-1]
+    return columns
+
+
+def describe(columns):
+    return ", ".join(f"{name} ({x.shape[1]} wide)" for name, x in columns.items())
 
 
 def check(paths, parts):
@@ -77,20 +61,11 @@ def check(paths, parts):
     for (path, part), (other, columns) in itertools.combinations(
         zip(paths, parts, strict=True), 2
     ):
-        if part.keys() != columns.keys():
-            with_key, without = path, other
-            if "next_observations" in columns:
-                with_key, without = other, path
+        if describe(part) != describe(columns):
             sys.exit(
-                f"{with_key} has next_observations and {without} has none: make a copy "
-                "of the former without them, or add them to the latter"
+                f"{path} has {describe(part)}, and {other} has {describe(columns)}: "
+                "join files of one robot, all with next_observations or all without"
             )
-        for name in part:
-            if part[name].shape[1:] != columns[name].shape[1:]:
-                sys.exit(
-                    f"{name} are {part[name].shape[1]} numbers wide in {path} and "
-                    f"{columns[name].shape[1]} in {other}: join files of one robot"
-                )
         if all(np.array_equal(part[name], columns[name]) for name in part):
             sys.exit(f"{path} and {other} hold the same data: name them once")
 
@@ -100,12 +75,12 @@ def main(args):
         if args.out.exists() and path.exists() and args.out.samefile(path):
             sys.exit(f"--out {args.out} is one of the files to join: name another")
     try_to_write(args.out)
-    parts, left_out = zip(*map(read, args.files), strict=True)
+    parts = [read(path) for path in args.files]
     check(args.files, parts)
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    for name in ("rewards", "terminals", "timeouts"):
+        joined[name] = joined[name].ravel()  # as D4RL's files have them
     write_or_exit(args.out, joined)
-    if names := set.union(*left_out):
-        print(f"left out, as the scripts don't read them: {', '.join(sorted(names))}")
     terminals, timeouts = joined["terminals"], joined["timeouts"]
     transitions = np.count_nonzero((terminals | ~timeouts)[:-1])
     print(
@@ -115,4 +90,7 @@ def main(args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    try:
+        main(tyro.cli(Args, description=__doc__))
+    except wpc.UserError as error:
+        sys.exit(str(error))

@@ -2,7 +2,7 @@
 """Makes a dataset in D4RL's format; D4RL's robots move in D4RL's physics.
 
 With --policy, episodes of a stochastic policy, as in D4RL's medium and expert data, or
-with --random of uniform actions. They are the same for any number of workers.
+with --random of uniform actions.
 
     python tests/tools/make_dataset.py --env hopper --steps 1000000 \\
         --policy hopper_medium-v2.hdf5 --out hopper_medium.hdf5
@@ -18,40 +18,25 @@ first 1,000 of them random.
 """
 
 import copy
-import functools
 import hashlib
 import io
 import itertools
-import multiprocessing
-import os
 import shlex
 import signal
 import sys
 import tempfile
-from collections import deque
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
 import numpy as np
 import torch
-import torch.nn as nn
 import torch.nn.functional as F
 import tyro
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import wpc
-
-
-def usable_cpus():
-    """How many CPUs this process may use; a job on a cluster often has few of many."""
-    if hasattr(os, "process_cpu_count"):  # since Python 3.13
-        return os.process_cpu_count() or 1
-    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 @dataclass
@@ -70,26 +55,38 @@ class Args:
     """D4RL file that records its policy, or an .npz of the same names (fc0.weight)"""
     random: bool = False
     """take uniform actions"""
-    workers: int = field(default_factory=usable_cpus)
-    """number of processes that collect; by default as many as there are CPUs to use"""
 
     # SAC
     random_steps: int = 5_000
     """steps of uniform actions before the agent acts and learns"""
-    discount: float = 0.99
-    """discount factor gamma"""
-    tau: float = 0.005
-    """rate of the target critics"""
-    lr: float = 3e-4
-    """learning rate of actor, critics and temperature"""
-    batch_size: int = 256
-    """number of transitions in a batch"""
 
     def __post_init__(self):
-        if min(self.steps, self.workers, self.batch_size) < 1:
-            raise ValueError("steps, workers and batch_size must be >= 1")
+        if self.steps < 1:
+            raise ValueError("steps must be >= 1")
         if self.policy and self.random:
             raise ValueError("--policy and --random exclude each other")
+
+
+def make_columns(steps, env):
+    """The arrays to fill, by D4RL's names."""
+    states = np.zeros((steps, *env.observation_space.shape), np.float32)
+    return {
+        "observations": states,
+        "actions": np.zeros((steps, *env.action_space.shape), np.float32),
+        "rewards": np.zeros(steps, np.float32),
+        "next_observations": states.copy(),
+        "terminals": np.zeros(steps, bool),
+        "timeouts": np.zeros(steps, bool),
+    }
+
+
+def do_step(env, state, action, data, t):
+    """Writes a step to row t; returns the next state, the reward, and if it is over."""
+    next_state, reward, terminal, truncated, _ = env.step(action)
+    row = (state, action, reward, next_state, terminal, truncated and not terminal)
+    for column, value in zip(data.values(), row, strict=True):
+        column[t] = value
+    return next_state, reward, terminal or truncated
 
 
 # --- Episodes of one policy -----------------------------------------------------------
@@ -130,78 +127,31 @@ def distribution(policy, state):
     return w_mean @ hidden + b_mean, np.exp(np.clip(w_std @ hidden + b_std, -20, 2))
 
 
-make_env = functools.cache(lambda env: wpc.make_envs(env, 1).envs[0])
+def collect(args, env, data, policy=None):
+    """Fills `data`; yields how many rows are filled and the last episode's return.
 
-
-def play(env, policy, seed, numbers):
-    """The rows of the episodes of these numbers, and the return of the last.
-
-    Episode k depends on `seed` and k alone. `policy` is None for uniform actions.
+    Episode k depends on the seed and k alone. Without a policy, actions are uniform.
     """
-    env, rows = make_env(env), []
     low, high = env.action_space.low, env.action_space.high
-    for k in numbers:
-        rng = np.random.default_rng([seed, k])
-        state, _ = env.reset(seed=int(rng.integers(2**31)))
-        over, episode_return = False, 0.0
-        while not over:
-            if policy:
-                mean, std = distribution(policy, np.float32(state))
-                action = high * np.tanh(mean + std * rng.standard_normal(len(std)))
-            else:
-                action = rng.uniform(low, high)
-            action = np.float32(action)
-            next_state, reward, terminal, truncated, _ = env.step(action)
-            timeout = truncated and not terminal
-            rows.append((state, action, reward, next_state, terminal, timeout))
-            state, over = next_state, terminal or truncated
-            episode_return += reward
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    columns = [x.astype("?" if x.dtype == bool else "f4") for x in columns]
-    return columns, episode_return
-
-
-def collect(args, env, data):
-    """Fills `data`; yields how many rows are filled and the last episode's return."""
-    policy = None
-    if args.policy:
-        widths = env.observation_space.shape[0], env.action_space.shape[0]
-        policy = load_policy(args.policy, *widths)
-    # Many processes of one thread each are faster than the other way round.
-    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    pool = ProcessPoolExecutor(args.workers, multiprocessing.get_context("spawn"))
-    parts, filled = deque(), 0
-    first = itertools.count(step=5)  # five episodes in a task
-    interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)  # not for the workers
-    try:
-        while filled < args.steps:
-            while len(parts) < 2 * args.workers:
-                k = next(first)
-                numbers = range(k, k + 5)
-                part = pool.submit(play, args.env, policy, args.seed, numbers)
-                parts.append(part)
-            signal.signal(signal.SIGINT, interrupt)
-            columns, episode_return = parts.popleft().result()
-            end = min(filled + len(columns[0]), args.steps)
-            for column, new in zip(data.values(), columns, strict=True):
-                column[filled:end] = new[: end - filled]
-            filled = end
-            yield filled, episode_return
-    finally:
-        pool.shutdown(cancel_futures=True)
+    episodes, over, episode_return = itertools.count(), True, np.nan
+    for t in range(args.steps):
+        if over:
+            last_return, episode_return = episode_return, 0.0
+            rng = np.random.default_rng([args.seed, next(episodes)])
+            state, _ = env.reset(seed=int(rng.integers(2**31)))
+        if policy:
+            mean, std = distribution(policy, np.float32(state))
+            action = high * np.tanh(mean + std * rng.standard_normal(len(std)))
+        else:
+            action = rng.uniform(low, high)
+        state, reward, over = do_step(env, state, np.float32(action), data, t)
+        episode_return += reward
+        yield t + 1, last_return
 
 
 # --- SAC ------------------------------------------------------------------------------
 
-
-def mlp(inputs, outputs):
-    return nn.Sequential(
-        nn.Linear(inputs, 256),
-        nn.ReLU(),
-        nn.Linear(256, 256),
-        nn.ReLU(),
-        nn.Linear(256, outputs),
-    )
+DISCOUNT, TAU, LEARNING_RATE, BATCH_SIZE = 0.99, 0.005, 3e-4, 256
 
 
 def sample_action(actor, observation):
@@ -223,13 +173,13 @@ def learn(args, env, data):
     max_action = float(env.action_space.high[0])
     tensors = {key: torch.from_numpy(column) for key, column in data.items()}
 
-    actor = mlp(state_dim, 2 * action_dim)
-    critics = nn.ModuleList(mlp(state_dim + action_dim, 1) for _ in range(2))
-    targets = copy.deepcopy(critics)
+    actor = wpc.mlp(state_dim, 2 * action_dim)
+    critic = wpc.Critic(state_dim, action_dim)
+    critic_target = copy.deepcopy(critic)
     log_alpha = torch.zeros(1, requires_grad=True)
-    actor_optimizer = torch.optim.Adam(actor.parameters(), args.lr, fused=True)
-    critic_optimizer = torch.optim.Adam(critics.parameters(), args.lr, fused=True)
-    alpha_optimizer = torch.optim.Adam([log_alpha], args.lr)
+    actor_optimizer = wpc.adam(actor, LEARNING_RATE)
+    critic_optimizer = wpc.adam(critic, LEARNING_RATE)
+    alpha_optimizer = torch.optim.Adam([log_alpha], LEARNING_RATE)
 
     state, _ = env.reset(seed=args.seed)
     last_return, episode_return = np.nan, 0.0
@@ -240,52 +190,41 @@ def learn(args, env, data):
             with torch.no_grad():
                 action, _ = sample_action(actor, torch.from_numpy(np.float32(state)))
             action = max_action * action.numpy()
-        next_state, reward, terminal, truncated, _ = env.step(action)
-        row = (state, action, reward, next_state, terminal, truncated and not terminal)
-        for column, value in zip(data.values(), row, strict=True):
-            column[t] = value
-        state, episode_return = next_state, episode_return + reward
-        if terminal or truncated:
+        state, reward, over = do_step(env, state, action, data, t)
+        episode_return += reward
+        if over:
             last_return, episode_return = episode_return, 0.0
             state, _ = env.reset()
         yield t + 1, last_return
         if t < args.random_steps:
             continue
 
-        i = torch.randint(t + 1, (args.batch_size,))
+        i = torch.randint(t + 1, (BATCH_SIZE,))
         s, s_next = tensors["observations"][i], tensors["next_observations"][i]
         a, r = tensors["actions"][i] / max_action, tensors["rewards"][i, None]
         running = ~tensors["terminals"][i, None]
         alpha = log_alpha.exp().detach()
         with torch.no_grad():
             a_next, log_prob = sample_action(actor, s_next)
-            sa_next = torch.cat([s_next, a_next], 1)
-            q_next = torch.minimum(targets[0](sa_next), targets[1](sa_next))
-            y = r + args.discount * running * (q_next - alpha * log_prob)
-        sa = torch.cat([s, a], 1)
-        critic_loss = F.mse_loss(critics[0](sa), y) + F.mse_loss(critics[1](sa), y)
+            q_next = torch.minimum(*critic_target(s_next, a_next))
+            y = r + DISCOUNT * running * (q_next - alpha * log_prob)
+        q1, q2 = critic(s, a)
+        critic_loss = F.mse_loss(q1, y) + F.mse_loss(q2, y)
         critic_optimizer.zero_grad()
         critic_loss.backward()
         critic_optimizer.step()
 
         pi, log_prob = sample_action(actor, s)
-        critics.requires_grad_(False)
-        sa = torch.cat([s, pi], 1)
-        q = torch.minimum(critics[0](sa), critics[1](sa))
-        actor_loss = (alpha * log_prob - q).mean()
+        actor_loss = (alpha * log_prob - torch.minimum(*critic(s, pi))).mean()
         actor_optimizer.zero_grad()
         actor_loss.backward()
         actor_optimizer.step()
-        critics.requires_grad_(True)
 
         alpha_loss = -log_alpha.exp() * (log_prob.detach().mean() - action_dim)
         alpha_optimizer.zero_grad()
         alpha_loss.backward()
         alpha_optimizer.step()
-        with torch.no_grad():
-            torch._foreach_lerp_(
-                list(targets.parameters()), list(critics.parameters()), args.tau
-            )
+        wpc.soft_update(critic_target, critic, TAU)
 
 
 # --- The file -------------------------------------------------------------------------
@@ -306,6 +245,14 @@ def try_to_write(path):
         path.unlink()
 
 
+def score(env, mean_return):
+    """What D4RL scores a return, as the end of a line; nothing for other robots."""
+    if not (robot := wpc.d4rl_robot(env)):
+        return ""
+    _, low, high = robot
+    return f"; D4RL's score {100 * (mean_return - low) / (high - low):.1f}"
+
+
 def describe(env, data):
     """A line on the episodes of the data, and their SHA-256."""
     ends = np.flatnonzero(data["terminals"] | data["timeouts"]) + 1
@@ -313,9 +260,7 @@ def describe(env, data):
     returns = [x.sum() for x in rewards]
     line = f"{len(ends):,} episodes, return {np.mean(returns):.1f} +- "
     line += f"{np.std(returns):.1f}, largest {np.max(returns):.1f}"
-    if robot := wpc.d4rl_robot(env):
-        _, low, high = robot
-        line += f"; D4RL's score {100 * (np.mean(returns) - low) / (high - low):.1f}"
+    line += score(env, np.mean(returns))
     digest = hashlib.sha256()
     for column in data.values():
         digest.update(column.tobytes())
@@ -369,26 +314,22 @@ def main(args):
     # What a cluster sends before a job's time is over acts as Ctrl-C does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try_to_write(args.out)
-    env = make_env(args.env)  # exits if the scripts can't use it
-    states = np.zeros((args.steps, *env.observation_space.shape), np.float32)
-    data = {
-        "observations": states,
-        "actions": np.zeros((args.steps, *env.action_space.shape), np.float32),
-        "rewards": np.zeros(args.steps, np.float32),
-        "next_observations": states.copy(),
-        "terminals": np.zeros(args.steps, bool),
-        "timeouts": np.zeros(args.steps, bool),
-    }
-    fill = collect if args.policy or args.random else learn
+    env = wpc.make_envs(args.env, 1).envs[0]
+    data = make_columns(args.steps, env)
+    if args.policy:
+        sizes = env.observation_space.shape[0], env.action_space.shape[0]
+        fill = collect(args, env, data, load_policy(args.policy, *sizes))
+    else:
+        fill = collect(args, env, data) if args.random else learn(args, env, data)
     filled = 0
     try:
         with tqdm(total=args.steps, disable=None) as progress:
-            for filled, episode_return in fill(args, env, data):
+            for filled, episode_return in fill:
                 progress.set_postfix_str(f"return {episode_return:.0f}", refresh=False)
                 progress.update(filled - progress.n)
     except KeyboardInterrupt:
         print("stopped")
-    finally:  # also where an environment or a worker fails
+    finally:  # also where an environment fails
         if filled:
             write(args, {key: column[:filled] for key, column in data.items()})
     if not filled:

@@ -1,74 +1,52 @@
 # SPDX-License-Identifier: MIT
-"""Films the beginning of an episode of a trained policy; no display is needed.
+"""Films an episode of one or more trained policies, side by side; no display is needed.
 
-python tests/tools/play.py runs/RUN --out policy.gif
+    python tests/tools/play.py runs/wPC runs/TD3+BC --out policies.gif
+
+All episodes begin with the same seed. Above each stands the name of its folder.
 """
 
-import importlib.util
 import math
 import os
-import re
 import sys
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-import gymnasium as gym
-import imageio.v2 as imageio
 import numpy as np
 import torch
 import tyro
-from PIL import Image
-from tqdm import tqdm
+from PIL import Image, ImageDraw, ImageEnhance, ImageFont
 
 # MuJoCo can't be imported if the library that this names is missing; `start` sets it
 # again, where what is missing can be said in a sentence.
 MUJOCO_GL = os.environ.pop("MUJOCO_GL", None)
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import mujoco  # noqa: E402
-from make_dataset import reason, try_to_write  # noqa: E402
+from make_dataset import reason, score, try_to_write  # noqa: E402
 
 import wpc  # noqa: E402
 
 
 @dataclass
 class Args:
-    run_dir: Annotated[Path, tyro.conf.Positional]
-    """folder of a run of any of the scripts"""
+    run_dirs: tyro.conf.Positional[list[Path]]
+    """folders of runs of any of the scripts"""
     out: Path
-    """a GIF, an MP4, PNG frames (FOLDER/%04d.png), or just a folder for these"""
+    """the GIF to write"""
     seed: int = 0
-    """seed of the episode"""
+    """seed of the episodes"""
     fps: int = 30
     """frames a second at most, in the environment's time"""
     frames: int = 100
     """number of frames at most"""
     size: int = 240
-    """width and height of the picture"""
+    """width and height of each policy's picture"""
 
     def __post_init__(self):
-        if min(self.fps, self.frames, self.size) < 1:
-            raise ValueError("fps, frames and size must be >= 1")
-
-
-def frame_path(out):
-    """The path to write to, with %d for PNG frames; exits if that is not possible."""
-    if out.suffix == "":
-        out /= "%04d.png"
-    film = out.suffix in (".gif", ".mp4") and "%" not in out.name
-    frames = re.fullmatch(r"[^%]*%\d*d[^%]*\.png", out.name)
-    if not (film or frames):
-        sys.exit(f"--out {out} must end in .gif, .mp4 or %04d.png, or be a folder")
-    if out.suffix == ".mp4" and not importlib.util.find_spec("imageio_ffmpeg"):
-        sys.exit("an MP4 needs a further package: pip install imageio-ffmpeg")
-    if out.suffix == ".png":
-        try:
-            out.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            sys.exit(f"--out can't be written: {error}")
-    try_to_write(out)
-    return out
+        if min(self.fps, self.frames, self.size, len(self.run_dirs)) < 1:
+            raise ValueError("name a run; fps, frames and size must be >= 1")
+        if self.out.suffix != ".gif":
+            raise ValueError(f"--out {self.out} must end in .gif")
 
 
 def load(run_dir):
@@ -91,16 +69,15 @@ def load(run_dir):
     return checkpoint, policy
 
 
-def make_env(env):
+def make_env(name):
     """The environment that the scripts evaluate on, with pictures."""
-    warnings.filterwarnings("ignore", ".*out of date")
-    robot = wpc.d4rl_robot(env)
-    env = gym.make(robot[0] if robot else env, render_mode="rgb_array")
+    env = wpc.make_envs(name, 1).envs[0]
+    env.unwrapped.render_mode = "rgb_array"
     renderer = getattr(env.unwrapped, "mujoco_renderer", None)
     if renderer:  # the camera that follows the robot, or -1, which stands still
         camera = mujoco.mjtObj.mjOBJ_CAMERA
         renderer.camera_id = mujoco.mj_name2id(env.unwrapped.model, camera, "track")
-    return wpc.use_d4rl_physics(env) if robot else env
+    return env
 
 
 def start(args, name):
@@ -127,47 +104,66 @@ def start(args, name):
     return env, observation
 
 
-def write(path, images, fps):
-    if path.suffix == ".gif":
-        images = [image.quantize(64, dither=Image.Dither.NONE) for image in images]
-        options = {"save_all": True, "append_images": images[1:], "loop": 0}
-        images[0].save(path, duration=1000 / fps, **options)
-    elif path.suffix == ".mp4":
-        imageio.mimsave(path, [np.asarray(image) for image in images], fps=fps)
-    else:
-        for i, image in enumerate(images):
-            image.save(path.with_name(path.name % i))
+def picture(env, size, text, dimmed=False):
+    """What the environment looks like, with text above."""
+    image = Image.fromarray(env.render()).resize((size, size))
+    if dimmed:
+        image = ImageEnhance.Brightness(image).enhance(0.5)
+    font = ImageFont.load_default(size / 18)
+    ImageDraw.Draw(image).text((size / 40, size / 60), text, "white", font)
+    return image
 
 
-def main(args):
-    path = frame_path(args.out)
-    checkpoint, policy = load(args.run_dir)
-    name = checkpoint["args"]["env"]
+def film(run_dir, args):
+    """An episode's pictures and their number a second; prints how it went."""
+    checkpoint, policy = load(run_dir)
+    name, seed = checkpoint["args"]["env"], checkpoint["args"]["seed"]
+    trained = checkpoint["evaluations"][-1]["step"]
+    title = f"{run_dir.resolve().name}\n{trained:,} training steps, seed {seed}\n"
     env, observation = start(args, name)
-    steps_per_second = env.metadata.get("render_fps", 30)
-    every = math.ceil(steps_per_second / args.fps)
+    fps = env.metadata.get("render_fps", 30)
+    every = math.ceil(fps / args.fps)
     images, episode_return, step, over = [], 0.0, 0, False
-    progress = tqdm(total=env.spec.max_episode_steps, disable=None)
     while not over:
         if step % every == 0 and len(images) < args.frames:
-            image = Image.fromarray(env.render())
-            images.append(image.resize((args.size, args.size)))
+            text = f"{title}step {step:,}, return {episode_return:,.0f}"
+            images.append(picture(env, args.size, text))
         observation, reward, terminated, truncated, _ = env.step(policy(observation))
         episode_return += reward
         step += 1
         over = terminated or truncated
-        progress.update()
-    progress.close()
+    end = f"{step:,} steps, return {episode_return:,.0f}"
+    if len(images) * every >= step:  # the end is in the film
+        images.append(picture(env, args.size, f"{title}ended: {end}", dimmed=True))
     env.close()
+    print(f"{run_dir}: {end}{score(name, episode_return)}")
+    return images, fps / every
+
+
+def write(path, films, fps):
+    """Writes a GIF of films side by side, in which the shorter wait for the longest."""
+    frames = []
+    for i in range(max(map(len, films))):
+        row = [np.asarray(images[min(i, len(images) - 1)]) for images in films]
+        frames.append(Image.fromarray(np.hstack(row)))
+    # One palette for all, so that what doesn't move need not be written again
+    some = [*frames[:: len(frames) // 4 + 1], frames[-1]]
+    palette = Image.fromarray(np.hstack(some)).quantize(64)
+    frames = [x.quantize(palette=palette, dither=Image.Dither.NONE) for x in frames]
+    durations = [1000 / fps] * (len(frames) - 1) + [3000]
+    options = {"save_all": True, "append_images": frames[1:], "loop": 0}
+    frames[0].save(path, duration=durations, **options)
+
+
+def main(args):
+    try_to_write(args.out)
+    films, fps = zip(*(film(run_dir, args) for run_dir in args.run_dirs), strict=True)
+    if len(set(fps)) > 1:
+        sys.exit("the runs must be of environments with the same render_fps")
     try:
-        write(path, images, steps_per_second / every)
+        write(args.out, films, fps[0])
     except OSError as error:
         sys.exit(f"--out {args.out} can't be written: {error}")
-    line = f"{args.out}: {step:,} steps, return {episode_return:.1f}"
-    if robot := wpc.d4rl_robot(name):
-        _, low, high = robot
-        line += f", D4RL's score {100 * (episode_return - low) / (high - low):.1f}"
-    print(line)
 
 
 if __name__ == "__main__":

@@ -2,34 +2,36 @@
 """Trains many runs at once on one GPU, with evaluation on the CPU's cores.
 
     python tests/tools/experiments.py list table1 --runs runs/paper > commands.txt
-    python tests/tools/together.py commands.txt
+    grep hopper commands.txt > hopper.txt
+    python tests/tools/together.py hopper.txt
 
 A step of one run leaves a GPU idle nearly all of the time. Here all R runs become one:
 a network's parameters are (R, P), a batch is (R, B, width), and each step is `update`
 of wpc.py, in which every mean over a batch is taken for each run by itself. TD3+BC is
-wPC with weight 1, and wBC is wPC with alpha 0; smaller robots are padded with zeros.
+wPC with V at minus infinity, which makes each weight 1, and wBC is wPC with alpha 0.
 The step is traced, compiled by torch.compile and captured as a CUDA graph.
 
 Networks start as the script starts them with the run's seed. Batches and noise are
 drawn for all runs together, so a run is not the one that the script makes with the same
-seed, but one as likely. Each run leaves args.json and evaluations.csv, as its script
-does, and a checkpoint.pt with its policy, for play.py; it can't be continued.
+seed, but one as likely. The runs must be of one robot. If you edit wpc.py, let `update`
+combine the rows of a batch by means alone. Each run leaves args.json and
+evaluations.csv, as its script does, and a checkpoint.pt with its policy, for play.py;
+it can't be continued.
 """
 
 import copy
-import csv
+import functools
 import hashlib
 import importlib
-import io
-import itertools
-import json
 import multiprocessing
+import os
+import pickle
 import re
 import shlex
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import gymnasium as gym
@@ -41,104 +43,61 @@ import torch.nn.functional as F
 import tyro
 from torch._inductor.compile_fx import compile_fx
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torch.overrides import TorchFunctionMode
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from compiled import TraceableAdam
-from make_dataset import usable_cpus
 
 import wpc
-
-CYCLE = 10  # steps in a CUDA graph
 
 
 @dataclass
 class Options:
     commands: tyro.conf.Positional[Path]
     """file of lines such as "python wpc.py --env ... --run-dir ...", a run each"""
-    seconds: float = float("inf")
-    """stop training after this time; what was evaluated until then is kept"""
-    workers: int = field(default_factory=lambda: max(1, usable_cpus() - 2))
-    """number of processes that evaluate; by default two fewer than there are CPUs"""
     tf32: bool = False
     """multiply matrices in TF32, which is faster, with 10 instead of 23 bits"""
     device: str = "cuda" if torch.cuda.is_available() else "cpu"
-    """where to train"""
-    compile: bool = True
-    """compile the traced steps"""
+    """where to train; on a CPU, nothing is compiled"""
 
 
 # --- Many networks as one -------------------------------------------------------------
 
 
 class Networks(nn.Module):
-    """R networks of the script's `mlp` as one, with parameters (R, P).
+    """R networks of the script's `mlp` as one, with parameters (R, P)."""
 
-    Inputs and outputs are as wide as `widths` says. Where a network is narrower, it has
-    zeros in place of weights, which stay zero, as its inputs there are zero;
-    `inputs[i]` are the places of network i's own inputs.
-    """
-
-    def __init__(self, networks, widths, inputs):
+    def __init__(self, networks):
         super().__init__()
-        ends = [widths[0], 256, 256, widths[1]]
-        self.shapes = list(itertools.pairwise(ends))
-        self.inputs = inputs
-        rows = [self.flatten(i, network) for i, network in enumerate(networks)]
+        self.shapes = [
+            layer.weight.shape for layer in networks[0] if isinstance(layer, nn.Linear)
+        ]
+        rows = [parameters_to_vector(x.parameters()).detach() for x in networks]
         self.flat = nn.Parameter(torch.stack(rows))
-
-    def own(self, i, network):
-        """The layers of network i, and where their inputs stand among all inputs."""
-        layers = [x for x in network if isinstance(x, nn.Linear)]
-        places = [self.inputs[i], *(range(x.in_features) for x in layers[1:])]
-        return zip(layers, map(torch.tensor, map(list, places)), strict=True)
-
-    def flatten(self, i, network):
-        parts = []
-        for (layer, places), shape in zip(
-            self.own(i, network), self.shapes, strict=True
-        ):
-            weight, bias = torch.zeros(shape), torch.zeros(shape[1])
-            weight[places, : layer.out_features] = layer.weight.detach().T
-            bias[: layer.out_features] = layer.bias.detach()
-            parts += [weight.flatten(), bias]
-        return torch.cat(parts)
-
-    def layers(self, flat):
-        """Weights (R, in, out) and biases (R, 1, out) of each layer."""
-        start = 0
-        for width, height in self.shapes:
-            middle, end = start + width * height, start + (width + 1) * height
-            weight = flat[:, start:middle].view(-1, width, height)
-            yield weight, flat[:, None, middle:end]
-            start = end
 
     def forward(self, x):
         """(R, B, in) to (R, B, out); of the first networks only, if x is of fewer."""
-        (w1, b1), (w2, b2), (w3, b3) = self.layers(self.flat[: len(x)])
-        x = F.relu(torch.bmm(x, w1) + b1)
-        x = F.relu(torch.bmm(x, w2) + b2)
-        return torch.bmm(x, w3) + b3
+        rest = self.flat[: len(x)]
+        for i, (height, width) in enumerate(self.shapes):
+            sizes = height * width, height, rest.shape[1] - height * (width + 1)
+            weight, bias, rest = rest.split(sizes, dim=1)
+            x = torch.bmm(x if i == 0 else F.relu(x), weight.view(-1, height, width).mT)
+            x = x + bias[:, None]
+        return x
 
     def copy_to(self, i, network):
-        """Writes network i of R into one of the script's."""
-        flat = self.flat.detach()[i : i + 1].cpu()
-        for (layer, places), (weight, bias) in zip(
-            self.own(i, network), self.layers(flat), strict=True
-        ):
-            layer.weight.data.copy_(weight[0, places, : layer.out_features].T)
-            layer.bias.data.copy_(bias[0, 0, : layer.out_features])
+        """Gives one of the script's networks the parameters of network i of R."""
+        vector_to_parameters(self.flat.detach()[i], network.parameters())
 
 
 class Critics(nn.Module):
     """The twin critics of R runs, as 2 R networks."""
 
-    def __init__(self, critics, widths, inputs):
+    def __init__(self, critics):
         super().__init__()
         networks = [critic.q1_net for critic in critics]
-        networks += [critic.q2_net for critic in critics]
-        self.net = Networks(networks, widths, inputs + inputs)
+        self.net = Networks(networks + [critic.q2_net for critic in critics])
 
     def forward(self, s, a):
         sa = torch.cat([s, a], dim=-1)
@@ -148,6 +107,22 @@ class Critics(nn.Module):
         return self.net(torch.cat([s, a], dim=-1))
 
 
+class Values(nn.Module):
+    """V of R runs; for the weight, it is minus infinity in those of TD3+BC."""
+
+    def __init__(self, values, scripts):
+        super().__init__()
+        self.net = Networks([value.net for value in values])
+        weight_1 = torch.tensor([[[script == "td3_bc"]] for script in scripts])
+        self.register_buffer("weight_1", weight_1)
+
+    def forward(self, s):
+        v = self.net(s)
+        if torch.is_grad_enabled():  # V is trained
+            return v
+        return v.masked_fill(self.weight_1, -torch.inf)
+
+
 class ForEachRun(TorchFunctionMode):
     """In it, a mean over (R, B, width) is one for each run, (R, 1, 1).
 
@@ -155,15 +130,13 @@ class ForEachRun(TorchFunctionMode):
     computed for those parameters only that the next optimizer step waits for.
     """
 
-    def __init__(self, parameters, action_dims):
+    def __init__(self, parameters):
         super().__init__()
         self.parameters = parameters
-        self.share = action_dims / action_dims.max()  # of actions that are no padding
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
         if function is torch.Tensor.mean and args[0].ndim == 3:
-            mean = args[0].mean(dim=(1, 2), keepdim=True)
-            return mean if args[0].shape[-1] == 1 else mean / self.share
+            return args[0].mean(dim=(1, 2), keepdim=True)
         if function is F.mse_loss:
             return (args[0] - args[1]).square().mean(dim=(1, 2), keepdim=True)
         if function is torch.Tensor.backward:
@@ -176,109 +149,56 @@ class ForEachRun(TorchFunctionMode):
         return function(*args, **(kwargs or {}))
 
 
-def weight_of_each_run(kinds, device="cpu"):
-    """`other_weight` of wpc.py for runs of the given kinds of weight."""
-    own = {}
-    for kind in sorted(set(kinds)):
-        own[kind] = torch.tensor([[[k == kind]] for k in kinds], device=device)
-    WEIGHT_MASKS[:] = own.values()
-
-    def other_weight(weight, advantage, batch, args):
-        results = {"binary": weight, "one": torch.ones_like(weight)}
-        if "random" in own:
-            permutation = torch.rand_like(weight).argsort(dim=1)
-            results["random"] = weight.gather(1, permutation)
-        for kind in own.keys() - results.keys():
-            kind_args = replace(args, weight=kind)
-            results[kind] = WPC_WEIGHT(weight, advantage, batch, kind_args)
-        for kind, mask in own.items():
-            weight = torch.where(mask, results[kind], weight)
-        return weight
-
-    return other_weight
-
-
-WPC_WEIGHT = wpc.other_weight
-WEIGHT_MASKS = []
-
-
 # --- All runs as one ------------------------------------------------------------------
 
 
-def system(args):
-    """Weight and alpha with which wpc.py does what the arguments' own script does."""
-    if hasattr(args, "weight"):
-        return args.weight, args.alpha
-    return ("one", args.alpha) if hasattr(args, "alpha") else ("binary", 0.0)
+def script_of(args):
+    return type(args).__module__
 
 
 class Runs:
-    """R runs that are trained as one. `dims` has each run's (state_dim, action_dim,
-    max_action), `data` what prepare_dataset returns."""
+    """R runs that are trained as one. `dims` is (state_dim, action_dim, max_action),
+    `data` has what prepare_dataset returns for each."""
 
     def __init__(self, runs, dims, data, device):
-        self.runs, self.dims, self.data, self.device = runs, dims, data, device
-        self.metrics, self.graph = {}, None
-        self.rows = [[] for _ in runs]  # of each run: (step, evaluation, other columns)
-        self.jobs = [[] for _ in runs]  # of each run: (evaluation, what is evaluated)
-        kinds, alphas = zip(*map(system, runs), strict=True)
-        wpc.other_weight = weight_of_each_run(kinds, device)
-
+        self.runs, self.data, self.device = runs, data, device
+        self.metrics = {}
         agents = []
-        for args, own in zip(runs, dims, strict=True):
+        for args in runs:
             torch.manual_seed(args.seed)
-            agents.append(wpc.Agent(*own, wpc.Args(seed=args.seed, device="cpu")))
-        self.actors = [agent.actor for agent in agents]
-        self.agent = agent = copy.copy(agents[0])
-        agent.args = wpc.Args(**shared(runs))
-        agent.args.alpha = torch.tensor(alphas, device=device).view(-1, 1, 1)
-        agent.args.weight = "each run's"
-        agent.actor = copy.deepcopy(self.actors[0])
-        state_dim, action_dim = max(x[0] for x in dims), max(x[1] for x in dims)
-        states = [list(range(own[0])) for own in dims]
-        inputs = [  # of a critic: the own states, and the own actions after all states
-            [*range(own[0]), *range(state_dim, state_dim + own[1])] for own in dims
-        ]
-        networks = [a.actor.net for a in agents]
-        agent.actor.net = Networks(networks, (state_dim, action_dim), states)
-        agent.value = copy.deepcopy(agents[0].value)
-        networks = [a.value.net for a in agents]
-        agent.value.net = Networks(networks, (state_dim, 1), states)
-        critics = [a.critic for a in agents]
-        agent.critic = Critics(critics, (state_dim + action_dim, 1), inputs)
-        for name, rate in RATES.items():
+            agents.append(wpc.Agent(*dims, wpc.Args(seed=args.seed, device="cpu")))
+        self.agent, self.actor = copy.copy(agents[0]), agents[0].actor
+        agent = self.agent
+        shared = {k: x for args in runs for k, x in asdict(args).items()}
+        known = {field.name for field in fields(wpc.Args)}
+        agent.args = wpc.Args(**{k: x for k, x in shared.items() if k in known})
+        alphas = [[[getattr(args, "alpha", 0.0)]] for args in runs]
+        agent.args.alpha = torch.tensor(alphas, device=device)
+        agent.actor = copy.deepcopy(agents[0].actor)
+        agent.actor.net = Networks([x.actor.net for x in agents])
+        agent.critic = Critics([x.critic for x in agents])
+        agent.value = Values([x.value for x in agents], map(script_of, runs))
+        for name in NETWORKS:
             network = getattr(agent, name).to(device)
-            optimizer = torch.optim.Adam(
-                network.parameters(), getattr(agent.args, rate)
-            )
+            rate = getattr(agent.args, f"{name}_lr")
+            optimizer = torch.optim.Adam(network.parameters(), rate)
             setattr(agent, f"{name}_optimizer", TraceableAdam(optimizer, device))
         agent.actor_target = copy.deepcopy(agent.actor)
         agent.critic_target = copy.deepcopy(agent.critic)
-
-        parameters = [getattr(agent, n).net.flat for n in RATES]
-        action_dims = torch.tensor([[[own[1]]] for own in dims], device=device)
-        self.mode = ForEachRun(parameters, action_dims)
+        self.mode = ForEachRun([getattr(agent, name).net.flat for name in NETWORKS])
         self.load(data)
 
     def load(self, data):
         """Puts all datasets into one, in which each run has its rows."""
         datasets = {id(dataset): dataset for dataset, *_ in data}
-        widths = {}
-        for dataset in datasets.values():
-            for name, column in dataset.items():
-                widths[name] = max(widths.get(name, 0), column.shape[1])
-        starts, columns, rows = {}, {name: [] for name in widths}, 0
-        for key, dataset in datasets.items():
-            starts[key], size = rows, len(dataset["rewards"])
-            rows += size
-            for name, width in widths.items():
-                column = dataset.get(name, torch.zeros(size, width))
-                columns[name].append(F.pad(column, (0, width - column.shape[1])))
-        self.columns = {k: torch.cat(x).to(self.device) for k, x in columns.items()}
-        start = [[starts[id(dataset)]] for dataset, *_ in data]
-        size = [[len(dataset["rewards"])] for dataset, *_ in data]
-        self.start = torch.tensor(start, device=self.device)
-        self.size = torch.tensor(size, device=self.device)
+        sizes = [len(dataset["rewards"]) for dataset in datasets.values()]
+        starts = dict(zip(datasets, np.cumsum([0, *sizes]), strict=False))
+        self.columns = {
+            name: torch.cat([x[name] for x in datasets.values()]).to(self.device)
+            for name in data[0][0]
+        }
+        own = [(starts[id(dataset)], len(dataset["rewards"])) for dataset, *_ in data]
+        self.start, self.size = torch.tensor(own, device=self.device).T[..., None]
 
     def sample(self):
         shape = (len(self.runs), self.agent.args.batch_size)
@@ -304,89 +224,103 @@ class Runs:
     def state(self):
         """All tensors that a step reads or writes."""
         tensors = [*self.columns.values(), self.start, self.size]
-        tensors += [self.mode.share, self.agent.args.alpha, *WEIGHT_MASKS]
+        tensors.append(self.agent.args.alpha)
         for part in vars(self.agent).values():
             if isinstance(part, nn.Module):
-                tensors += part.parameters()
+                tensors += [*part.parameters(), *part.buffers()]
             elif isinstance(part, TraceableAdam):
                 tensors += [part.beta1_power, part.beta2_power]
                 tensors += [x for state in part.states for x in state.values()]
         return tensors
 
-    def compile(self, compiler=compile_fx):
+    def compile(self, compiler):
         """Traces two steps, which does them, and compiles them."""
         state = self.state()
         with torch.enable_grad():
             graph = make_fx(lambda *_: self.two_steps())(*state)
         self.inputs = [tensor.detach() for tensor in state]  # the same memory
-        self.metrics = dict.fromkeys(self.metrics)
         with torch.no_grad():
             self.compiled = compiler(graph, self.inputs)
 
     @torch.no_grad()
-    def do(self, steps):
-        for _ in range(steps // 2):
-            values = self.compiled(*self.inputs)
+    def two_compiled_steps(self):
+        values = self.compiled(*self.inputs)
         self.metrics = dict(zip(self.metrics, values, strict=True))
 
-    def cycle(self):
-        """Does CYCLE steps."""
-        if self.graph is None:
-            self.do(CYCLE)
-        else:
-            self.graph.replay()
-
     def capture(self):
-        """From here on, a cycle is a CUDA graph."""
-        self.graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self.graph):
-            self.do(CYCLE)
+        """Makes two compiled steps a CUDA graph, without doing them."""
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self.two_compiled_steps()
+        self.two_compiled_steps = graph.replay
 
     def snapshot(self):
-        """Of each run: what `evaluate_run` needs, and its row so far."""
-        metrics = {
-            name: metric.flatten().tolist()
-            for name, metric in self.metrics.items()
-            if metric is not None
-        }
-        network = copy.deepcopy(self.agent.actor.net).cpu()
+        """Of each run: what to evaluate, its checkpoint, and its row but for scores."""
+        metrics = {name: x.flatten().tolist() for name, x in self.metrics.items()}
+        networks = copy.deepcopy(self.agent.actor.net).cpu()
         for i, args in enumerate(self.runs):
-            network.copy_to(i, self.actors[i].net)
-            state = self.actors[i].state_dict().items()
-            actor = {name: tensor.numpy().copy() for name, tensor in state}
+            networks.copy_to(i, self.actor.net)
+            actor = copy.deepcopy(self.actor)
             _, mean, std, best_return = self.data[i]
-            row = {name: metric[i] for name, metric in metrics.items()}
-            for name in ABSENT[type(args).__module__] & row.keys():
+            identity = asdict(args) | {"dataset": [mean.tolist(), std.tolist()]}
+            identity["made_by"] = "together.py"  # so that no script goes on
+            for name in ("max_timesteps", "device", "run_dir"):
+                del identity[name]
+            checkpoint = {
+                "args": asdict(args),
+                "identity": identity,
+                "agent": {"actor": actor.state_dict()},
+                "mean": mean,
+                "std": std,
+                "max_action": actor.max_action,
+            }
+            row = {name: x[i] for name, x in metrics.items()}
+            for name in ABSENT[script_of(args)] & row.keys():
                 del row[name]
-            job = (args, self.dims[i], actor, mean.numpy(), std.numpy())
-            yield job, {"best_discounted_return": best_return} | row
+            row["best_discounted_return"] = best_return
+            yield (args, actor, mean, std), checkpoint, row
 
 
-def shared(runs):
-    """The arguments that all runs have in common, also those only some scripts have."""
-    return {k: v for args in runs for k, v in asdict(args).items() if k in SHARED}
-
-
-SHARED = ("batch_size", "discount", "tau", "policy_noise", "noise_clip", "policy_freq")
-SHARED += ("actor_lr", "critic_lr", "value_lr", "beta")
-RATES = {"critic": "critic_lr", "value": "value_lr", "actor": "actor_lr"}
+NETWORKS = ("critic", "value", "actor")
 ABSENT = {"wpc": set(), "td3_bc": {"v", "value_loss", "weight"}, "wbc": {"lmbda"}}
 
 # --- Evaluation -----------------------------------------------------------------------
 
-ENVS = {}
+make_envs = functools.cache(wpc.make_envs)
 
 
-def evaluate_run(args, dims, actor, mean, std):
+def evaluate_run(job):
     """The script's own evaluation, in a process of its own."""
     torch.set_num_threads(1)
-    key = args.env, args.eval_episodes
-    if key not in ENVS:
-        ENVS[key] = wpc.make_envs(args.env, args.eval_episodes)
-    network = wpc.Actor(*dims)
-    network.load_state_dict({k: torch.from_numpy(x) for k, x in actor.items()})
-    mean, std = torch.from_numpy(mean), torch.from_numpy(std)
-    return wpc.evaluate(ENVS[key], network, mean, std, args)
+    args, actor, mean, std = pickle.loads(job)
+    return wpc.evaluate(make_envs(args.env, args.eval_episodes), actor, mean, std, args)
+
+
+class Evaluations:
+    """Evaluates the runs in other processes, and keeps the results in their folders."""
+
+    def __init__(self, runs, pool, made_by):
+        self.runs, self.pool, self.made_by = runs, pool, made_by
+        self.rows, self.pending = [[] for _ in runs.runs], []
+
+    def begin(self, step, speed):
+        """Begins an evaluation, when the one before has ended."""
+        self.end()
+        self.step = step
+        for job, checkpoint, row in self.runs.snapshot():
+            job = pickle.dumps(job)  # else each tensor would be an open file
+            row["steps_per_second"] = speed
+            self.pending.append((self.pool.submit(evaluate_run, job), checkpoint, row))
+
+    def end(self):
+        """Waits for the evaluation that has begun, and writes what it found."""
+        for i, (future, checkpoint, row) in enumerate(self.pending):
+            args, rows = self.runs.runs[i], self.rows[i]
+            rows.append({"step": self.step} | future.result() | row)
+            os.makedirs(args.run_dir, exist_ok=True)
+            checkpoint["evaluations"] = rows
+            wpc.save(Path(args.run_dir), checkpoint, asdict(args) | self.made_by)
+        self.pending = []
 
 
 # --- Training -------------------------------------------------------------------------
@@ -416,132 +350,62 @@ def read_commands(path):
             sys.exit(f"{runs[-1].run_dir} holds a run already: name another --run-dir")
     if len({args.run_dir for args in runs}) < len(runs):
         sys.exit(f"{path}: each line must have a --run-dir of its own")
-    for name in (*SHARED, "eval_freq"):
-        if len({getattr(args, name) for args in runs if hasattr(args, name)}) > 1:
-            sys.exit(f"{path}: all runs must have the same {name}")
-    if not runs or runs[0].policy_freq != 2 or runs[0].eval_freq % CYCLE:
-        sys.exit(
-            f"{path} must have runs with policy_freq 2 and an eval_freq that {CYCLE} "
-            "divides"
-        )
-    if any(args.max_timesteps % args.eval_freq for args in runs):
-        sys.exit(f"{path}: eval_freq must divide each run's max_timesteps")
+    shared = {}
+    for args in runs:
+        for name, value in asdict(args).items():
+            if shared.setdefault(name, value) != value and name not in MAY_DIFFER:
+                sys.exit(f"{path}: all runs must have the same {name}")
+    if not runs or runs[0].policy_freq != 2 or runs[0].eval_freq % 2:
+        sys.exit(f"{path} must have runs with policy_freq 2 and an even eval_freq")
+    if runs[0].max_timesteps % runs[0].eval_freq:
+        sys.exit(f"{path}: eval_freq must divide max_timesteps")
     return runs
+
+
+MAY_DIFFER = ("env", "dataset", "alpha", "seed", "device", "run_dir")
 
 
 def load(runs, device):
     """The runs as one, with their datasets."""
-    data, dims = {}, {}
+    datasets, sizes = {}, set()
     for args in runs:
-        if args.env not in dims:
-            envs = wpc.make_envs(args.env, 1)
-            states, actions = envs.single_observation_space, envs.single_action_space
-            dims[args.env] = states.shape[0], actions.shape[0], float(actions.high[0])
-        path = args.dataset or wpc.download_dataset(args.env)
-        if path not in data:
-            # With the static weight's column, whether a run needs it or not
-            options = wpc.Args(args.env, path, discount=args.discount, device="cpu")
-            options.weight = "static"
-            arrays = wpc.read_dataset(path, *dims[args.env])
-            data[path] = wpc.prepare_dataset(arrays, options)
-    if len({max_action for _, _, max_action in dims.values()}) > 1:
-        sys.exit("the robots' actions must all have the same bounds")
-    own_dims = [dims[args.env] for args in runs]
-    own_data = [data[args.dataset or wpc.download_dataset(args.env)] for args in runs]
-    return Runs(runs, own_dims, own_data, device)
-
-
-def succeeded(future):
-    return future.done() and not future.exception()
-
-
-def write_runs(runs, made_by):
-    """Writes what each run leaves, as far as it is evaluated."""
-    for args, rows, jobs in zip(runs.runs, runs.rows, runs.jobs, strict=True):
-        done = [
-            {"step": step} | future.result() | row
-            for step, future, row in rows
-            if succeeded(future)
-        ]
-        if not done:
+        key = args.env, args.dataset
+        if key in datasets:
             continue
-        folder = Path(args.run_dir)
-        folder.mkdir(parents=True, exist_ok=True)
-        record = json.dumps(asdict(args) | made_by, indent=2)
-        wpc.write_file(folder / "args.json", record.encode())
-
-        table = io.StringIO()
-        writer = csv.DictWriter(table, done[-1], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(done)
-        wpc.write_file(folder / "evaluations.csv", table.getvalue().encode())
-
-        evaluated = [i for i, (future, _) in enumerate(jobs) if succeeded(future)]
-        del jobs[: evaluated[-1]]  # so that the first is the last that was evaluated
-        _, (*_, max_action), actor, mean, std = jobs[0][1]
-        checkpoint = {
-            "args": asdict(args) | {"made_by": "together.py"},  # so no script goes on
-            "agent": {"actor": {k: torch.from_numpy(x) for k, x in actor.items()}},
-            "mean": torch.from_numpy(mean),
-            "std": torch.from_numpy(std),
-            "max_action": max_action,
-        }
-        content = io.BytesIO()
-        torch.save(checkpoint, content)
-        wpc.write_file(folder / "checkpoint.pt", content.getvalue())
+        envs = wpc.make_envs(args.env, 1)
+        states, actions = envs.single_observation_space, envs.single_action_space
+        dims = states.shape[0], actions.shape[0], float(actions.high[0])
+        sizes.add(dims)
+        path = args.dataset or wpc.download_dataset(args.env)
+        options = wpc.Args(args.env, path, discount=args.discount, device="cpu")
+        datasets[key] = wpc.prepare_dataset(wpc.read_dataset(path, *dims), options)
+    if len(sizes) > 1:
+        sys.exit("the runs must be of one robot: make a file for each robot's commands")
+    data = [datasets[args.env, args.dataset] for args in runs]
+    return Runs(runs, dims, data, device)
 
 
-def train(runs, options, pool, made_by):
-    """Trains to the largest max_timesteps; a run is evaluated up to its own."""
-    begin, waiting = time.perf_counter(), []
-
-    def submit(step, speed):
-        for i, (job, row) in enumerate(runs.snapshot()):
-            if step <= runs.runs[i].max_timesteps:
-                waiting.append(pool.submit(evaluate_run, *job))
-                row["steps_per_second"] = speed
-                runs.rows[i].append((step, waiting[-1], row))
-                runs.jobs[i].append((waiting[-1], job))
-
-    def wait(most):
-        """Until at most so many evaluations are to come."""
-        while len(waiting) > most:
-            waiting.pop(0).result()
-
-    submit(0, 0.0)
-    runs.compile(compile_fx if options.compile else lambda graph, inputs: graph)
-    runs.do(CYCLE - 2)
-    step = CYCLE
-    if options.device == "cuda":
-        runs.capture()
-    wait(0)
-    write_runs(runs, made_by)
-    print(f"compiled after {time.perf_counter() - begin:.0f} s", flush=True)
-    eval_freq = runs.runs[0].eval_freq
-    last = max(args.max_timesteps for args in runs.runs)
-    clock = time.perf_counter()
-    for evaluation in tqdm(range(eval_freq, last + 1, eval_freq), disable=None):
-        begin_step = step
-        while step + CYCLE <= evaluation:
-            runs.cycle()
-            step += CYCLE
-        if options.device == "cuda":
+def train(runs, evaluations, compiler=None):
+    """Trains to the end; with a compiler, by a CUDA graph of what it makes."""
+    args, begin = runs.runs[0], time.perf_counter()
+    evaluations.begin(0, 0.0)
+    runs.compile(compiler or (lambda graph, inputs: graph))
+    step = 2
+    evaluations.end()  # a broken environment is found early
+    for evaluation in range(args.eval_freq, args.max_timesteps + 1, args.eval_freq):
+        clock, first = time.perf_counter(), step
+        while step < evaluation:
+            runs.two_compiled_steps()
+            step += 2
+            if step == 10 and compiler:
+                runs.capture()
+        if compiler:
             torch.cuda.synchronize()
-        now = time.perf_counter()
-        speed = (step - begin_step) / (now - clock)
-        submit(evaluation, speed)
-        if evaluation % (10 * eval_freq) == 0:
-            write_runs(runs, made_by)
-            print(
-                f"step {evaluation:,} after {now - begin:.0f} s, {speed:.0f} steps/s "
-                f"of {len(runs.runs)} runs, {len(waiting)} evaluations to come",
-                flush=True,
-            )
-        if now - begin > options.seconds:
-            break
-        wait(4 * len(runs.runs))
-        clock = time.perf_counter()
-    wait(0)
+        speed = (step - first) / (time.perf_counter() - clock)
+        seconds = time.perf_counter() - begin
+        print(f"step {step:,} after {seconds:.0f} s, {speed:.0f} steps/s", flush=True)
+        evaluations.begin(step, speed)
+    evaluations.end()
 
 
 def main():
@@ -560,12 +424,11 @@ def main():
     print(f"{len(runs.runs)} runs on {made_by['trained_on']}", flush=True)
     context = multiprocessing.get_context("spawn")
     try:
-        with ProcessPoolExecutor(options.workers, context) as pool:
-            train(runs, options, pool, made_by)
+        with ProcessPoolExecutor(len(os.sched_getaffinity(0)), context) as pool:
+            evaluations = Evaluations(runs, pool, made_by)
+            train(runs, evaluations, compile_fx if on_gpu else None)
     except KeyboardInterrupt:
         sys.exit("stopped; what was evaluated is kept")
-    finally:  # when the pool has ended what it had begun
-        write_runs(runs, made_by)
 
 
 if __name__ == "__main__":
