@@ -191,6 +191,14 @@ def test_a_report_by_hand(tool, tmp_path):
     hopper, _ = tables["Differences"]
     assert hopper["wPC - TD3+BC"] == hopper["wPC - wBC"] == expected
 
+    totals = [list(row.values()) for row in tables["Totals"]]
+    assert totals == [  # the paper's on the same two tasks, CORL's, the paper's in all
+        ["wPC", "2", "14.0", "172.5", "-", "800.7"],
+        ["TD3+BC", "2", "28.0", "140.9", "143.1", "712.9"],
+        ["wBC", "2", "28.0", "145.2", "-", "712.7"],
+        ["BC", "1", "4.0", "52.9", "53.5", "475.5"],
+    ]
+
     (row,) = tables["Other weights (Table 2, Figure 4)"]
     assert row["static weight"] == "6.0 (1; 0.12k)" and row["wPC-e, paper"] == "67.0"
     assert row["wPC"] == "2.0 ± 1.0 (3; 0.12k)"
@@ -361,10 +369,12 @@ def test_the_data_have_a_score_of_their_own(tmp_path, monkeypatch):
     path = tmp_path / "tests/results/datasets.csv"
     path.parent.mkdir(parents=True)
     path.write_text(
-        "task,mean_score,best_return\nhopper-medium,44.2,10.0\nwalker2d-medium,9,11.0\n"
+        "task,transitions,mean_score,best_return\nhopper-medium,1000,44.2,10.0\n"
+        "walker2d-medium,2000,9,11.0\n"
     )
     table = experiments.score_table(groups, ["hopper-medium", "walker2d-medium"], [])
-    rows = ["| hopper-medium | 44.2 |", "| walker2d-medium | - |"]
+    rows = ["| hopper-medium | 44.2 | 1,000, of D4RL's policy |"]
+    rows.append("| walker2d-medium | - | - |")
     assert table.splitlines()[2:] == rows
 
 
@@ -374,7 +384,7 @@ def test_a_report_on_tasks_of_ones_own(tool, tmp_path):
     _, tables = report(tool, tmp_path, tmp_path / "report")
     (row,) = tables["Table 1"]
     assert row["task"] == "mine" and row["BC"] == "10.0 (1; 0.12k)"
-    assert figures(tmp_path / "report") == set()
+    assert "Totals" not in tables and figures(tmp_path / "report") == set()
 
 
 def test_a_report_without_runs(tmp_path):

@@ -367,7 +367,7 @@ def test_its_change_for_another_logger_works(monkeypatch, tmp_path):
 
 def test_its_program_trains_on_data_in_memory(capsys):
     names = {}
-    exec(block("python", "in memory"), names)
+    exec(block("python", "prepare_dataset"), names)
     assert "normalized_score" in capsys.readouterr().out.splitlines()[-1]
     assert names["step"] == 100
     assert all(p.isfinite().all() for p in names["agent"].critic.parameters())
@@ -421,10 +421,10 @@ def test_what_it_says_of_curves_is_in_the_runs():
 
 
 def test_its_last_evaluations_are_in_the_runs():
-    last = (
+    last = [
         f"{scores(script, 'hopper-medium')[1][:, -1].mean():.1f}"
         for script in ("wpc", "td3_bc")
-    )
+    ]
     sentence = "By last evaluations, the paper's measure, *hopper-medium* has {} (wPC)"
     assert (sentence + " and {} (TD3+BC).").format(*last) in RESULTS
     sentence = "our last ones on *hopper-medium* are {} (wPC) and {} (TD3+BC)."

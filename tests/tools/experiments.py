@@ -63,6 +63,12 @@ SYSTEMS = {
     "wPC-rnd": ("#56B4E9", ":"),
     "static weight": ("#D55E00", (0, (8, 2))),
 }
+OUR_DATA = {
+    "random": "of uniform actions",
+    "medium": "of D4RL's policy",
+    "medium-replay": "of our SAC agent (D4RL: 202,000, 402,000 and 302,000)",
+    "medium-expert": "of D4RL's medium policy and an expert that is not D4RL's",
+}
 COMPARED = ["wPC", "TD3+BC", "wBC"]
 OF_WEIGHTS = {"exponential": "wPC-e", "random": "wPC-rnd", "static": "static weight"}
 NOT_COMPARED = "env dataset seed max_timesteps eval_freq eval_episodes device run_dir"
@@ -247,28 +253,30 @@ def published(source, task):
     return scores.get(task, "-")
 
 
-def scores_of_data(groups):
-    """By task, the mean score of the episodes trained on, if datasets.csv has them."""
+def known_data(groups):
+    """By task, the row of datasets.csv on the data trained on, if it has one."""
     best = {group.task: group.data for group in groups.values() if not group.others}
     with (ROOT / "tests/results/datasets.csv").open() as file:
         rows = list(csv.DictReader(file))
-    rows = [row for row in rows if best.get(row["task"]) == row["best_return"]]
-    return {row["task"]: row["mean_score"] for row in rows}
+    return {x["task"]: x for x in rows if best.get(x["task"]) == x["best_return"]}
 
 
 def score_table(groups, tasks, systems):
-    """Our scores, and beside them those that were published."""
-    header, rows, data = ["task", "the data"], [], scores_of_data(groups)
+    """Our scores, beside them those that were published, and whose data are ours."""
+    header, rows, data = ["task", "the data"], [], known_data(groups)
     for system in systems:
         header.append(system)
         header += [source for source in PUBLISHED if source.startswith(f"{system},")]
     for task in tasks:
-        row = [task, data.get(task, "-")]
+        row, whose = [task, "-"], "-"
+        if task in data:
+            row[1], count = data[task]["mean_score"], int(data[task]["transitions"])
+            whose = f"{count:,}, {OUR_DATA.get(task.partition('-')[2], 'own')}"
         for name in header[2:]:
             group = groups.get((task, name, ""))
             row.append(group.score if group else published(name, task))
-        rows.append(row)
-    return markdown(header, rows)
+        rows.append([*row, whose])
+    return markdown([*header, "whose data"], rows)
 
 
 def difference(group, other):
@@ -294,6 +302,22 @@ def difference_table(groups, tasks, systems):
         rows.append([task, *(difference(group, other) for other in rest)])
     rows = [row for row in rows if set(row[1:]) != {"-"}]
     return markdown(["task", *(f"{first} - {other}" for other in others)], rows)
+
+
+def totals_table(groups, systems):
+    """Sums over the tasks of Table 1 that a system has runs on, ours and published."""
+    rows = []
+    for system in systems:
+        tasks = [task for task in TASKS if (task, system, "") in groups]
+        ours = sum(groups[task, system, ""].last_ten().mean() for task in tasks)
+        row = [system, str(len(tasks)), f"{ours:.1f}"]
+        for source, summed in (("paper", tasks), ("CORL", tasks), ("paper", TASKS)):
+            scores = [published(f"{system}, {source}", task) for task in summed]
+            row.append("-" if "-" in scores else f"{sum(map(float, scores)):.1f}")
+        if tasks:
+            rows.append(row)
+    header = ["system", "tasks", "these runs", "paper", "CORL", "paper, all twelve"]
+    return markdown(header, rows)
 
 
 def span(values, form):
@@ -416,13 +440,17 @@ INTRODUCTION = """\
 Scores are D4RL's normalized ones, or returns where a task is called "(mean return)". A
 score is the mean of a run's last ten evaluations; over seeds: mean ± sample standard
 deviation (seeds; training steps). What the paper and CORL have published is of D4RL's
-own files. "The data" is the mean score of the episodes trained on, where the report
-knows them (tests/results/datasets.csv); whose they are is in tests/results/README.md.
-Runs whose arguments differ from the scripts' defaults are in the table on Q alone.
+own files. "The data" is the mean score of the episodes trained on and "whose data" the
+number of transitions and whom they are of, where the report knows them
+(tests/results/datasets.csv). Runs whose arguments differ from the scripts' defaults are
+in the table on Q alone.
 """
 NOTES = {
     "Differences": "Mean, 95% interval and p of Welch's t test, not corrected for "
     "the number of tests (seeds of each; steps).",
+    "Totals": "Over the tasks of Table 1 on which a system has runs here, which are "
+    "not the same for all systems; beside them what is published for the same tasks. "
+    "(Of all twelve, the paper prints 711.4 for wBC, but its scores add up to 712.7.)",
     "When does Q run away?": "Q (its mean over a batch) divided by the best discounted "
     "return-to-go of the data, from the lowest to the highest seed: the mean "
     "of the last ten evaluations, the largest and its step; how many seeds had it over "
@@ -459,6 +487,7 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
     others = tasks_of(*OF_WEIGHTS.values())
     tables = {
         "Table 1": score_table(groups, all_tasks, table_1),
+        "Totals": totals_table(groups, table_1),
         "Differences": difference_table(groups, tasks_of(*COMPARED), COMPARED),
         "Other weights (Table 2, Figure 4)": score_table(groups, others, weights),
         "Differences to other weights": difference_table(
