@@ -30,6 +30,7 @@ from conftest import (
     wait_until,
     wbc,
     wpc,
+    wpc_with,
 )
 from torch._inductor.exc import InductorError
 from torch.utils.flop_counter import FlopCounterMode
@@ -42,7 +43,7 @@ VARIANTS = [
     (script, {"policy_freq": n}) for script in (wpc, td3_bc, wbc) for n in (2, 3)
 ]
 VARIANTS += [(wpc, {"policy_freq": 1})]
-VARIANTS += [(wpc, {"weight": w}) for w in ("exponential", "random", "static")]
+VARIANTS += [(wpc_with(w), {}) for w in ("exponential", "random", "static")]
 
 
 @pytest.fixture
@@ -67,48 +68,63 @@ def state(agent):
     return {k: x.state_dict() for k, x in vars(agent).items() if k != "args"}
 
 
-def twenty_steps(script, args, compile_update=None):
-    """The metrics of each step, and what is saved after the last."""
+def one_by_one(agent, update, sample_batch):
+    """The script's own steps, called as compiled ones."""
+    return lambda dataset, step: update(agent, sample_batch(dataset, 32), step)
+
+
+def do_steps(script, args, make_steps=one_by_one, kept=(21,), last=21):
+    """The metrics so far, what is saved and the random state after the steps `kept`."""
     torch.manual_seed(0)
     agent = script.Agent(5, 2, 1.0, args)
-    update = agent.update
-    if compile_update:
-        update = compile_update(agent, script.Agent.update)
-    metrics = []
-    for step in range(1, 21):
-        metrics.append({k: x.item() for k, x in update(random_batch(), step).items()})
-    return metrics, state(agent)
+    steps = make_steps(agent, script.Agent.update, script.sample_batch)
+    dataset, metrics, found = random_batch(), {}, []
+    for step in range(1, last + 1):
+        metrics |= steps(dataset, step)
+        if step in kept:
+            values = {name: metric.item() for name, metric in metrics.items()}
+            saved = copy.deepcopy(state(agent))
+            found.append((values, saved, torch.get_rng_state()))
+    return found
 
 
-def compile_traced(monkeypatch):
-    """From here on, torch.compile traces and does not compile what it has traced."""
-    real_compile = torch.compile
+@pytest.fixture
+def traced(monkeypatch):
+    """What is traced is not compiled; the steps that the tool did itself, so far."""
+    done = []
 
-    def only_trace(function, options, **arguments):
-        return real_compile(function, backend="eager", **arguments)
+    def as_it_is(graph, *_):
+        done.append(graph)
+        return graph.forward
 
-    monkeypatch.setattr(torch, "compile", only_trace)
+    monkeypatch.setattr(torch._inductor, "compile", as_it_is)
     torch._dynamo.reset()
+    return done
 
 
 @pytest.mark.parametrize("script, options", VARIANTS)
-def test_the_traced_step_is_the_step(float64, monkeypatch, script, options):
-    compile_traced(monkeypatch)
-    if script is wpc:
-        gathered = compiled.gathered(wpc.other_weight)
-        monkeypatch.setattr(wpc, "other_weight", gathered)
-    args = script.Args(device="cpu", **options)
-    eager = twenty_steps(script, args)
-    traced = twenty_steps(script, args, compiled.compile_update)
-    torch.testing.assert_close(traced, eager, rtol=1e-9, atol=1e-12)
+def test_the_traced_step_is_the_step(float64, traced, script, options):
+    args = script.Args(device="cpu", batch_size=32, max_timesteps=21, **options)
+    eager = do_steps(script, args)
+    ours = do_steps(script, args, compiled.two_steps_a_call)
+    torch.testing.assert_close(ours, eager, rtol=1e-9, atol=1e-12)
+    # Without and with the policy's update; with policy_freq 3 it comes first or second
+    assert len(traced) == {1: 1, 2: 1, 3: 3}[args.policy_freq]
 
 
-def test_the_random_weight_is_the_scripts():
-    weight, args = torch.rand(50, 1), wpc.Args(weight="random")
-    torch.manual_seed(0)
-    ours = compiled.gathered(wpc.other_weight)(weight, None, None, args)
-    torch.manual_seed(0)
-    assert torch.equal(ours, wpc.other_weight(weight, None, None, args))
+@pytest.mark.parametrize("eval_freq", [1, 4, 5])
+def test_no_step_waits_while_the_policy_is_evaluated(float64, traced, eval_freq):
+    """Where the script evaluates and saves, all is as it is after that step."""
+    args = td3_bc.Args(
+        device="cpu", batch_size=32, eval_freq=eval_freq, max_timesteps=13
+    )
+    kept = (*range(eval_freq, 13, eval_freq), 13)
+    found = [
+        do_steps(td3_bc, args, make_steps, kept, last=13)
+        for make_steps in (one_by_one, compiled.two_steps_a_call)
+    ]
+    torch.testing.assert_close(*found, rtol=1e-9, atol=1e-12)
+    assert bool(traced) == (eval_freq > 1)
 
 
 def test_a_continued_adam_has_the_same_powers_of_its_betas():
@@ -153,50 +169,49 @@ def assert_equal_but_for_rounding(run_dir, other):
 
 
 def test_compiled_runs(tmp_path):
-    """One test, as the first run compiles for a minute and the others use its code, and
-    of the random weight, as torch.compile fails on the script's index by randperm."""
+    """One test, as the first run compiles for a minute and the others use its code."""
     plain, whole, killed = (tmp_path / name for name in "abc")
-    random = ("--weight", "random")
-    run_here(wpc, *command("wpc", *random, "--run-dir", plain))
-    process = run(*compiled_command(*random, "--run-dir", whole))
+    run_here(wpc, *command("wpc", "--run-dir", plain))
+    process = run(*compiled_command("--run-dir", whole))
     assert process.returncode == 0, process.stderr
     assert_equal_but_for_rounding(whole, plain)
     assert read_rows(whole) != read_rows(plain)  # or nothing was compiled
 
     # Killed and continued, a run ends as it would have.
-    process = start(*compiled_command(*random, "--run-dir", killed))
+    process = start(*compiled_command("--run-dir", killed))
     wait_until((killed / "checkpoint.pt").exists, process)
     process.kill()
     process.communicate()
     assert load(killed)["step"] < 60
-    process = run(*compiled_command(*random, "--run-dir", killed))
+    process = run(*compiled_command("--run-dir", killed))
     assert process.returncode == 0, process.stderr
     assert as_bits(load(killed)) == as_bits(load(whole))
     assert read_rows(killed) == read_rows(whole)
 
     # From step 60 on, the run goes on without the tool.
     for folder in (plain, whole):
-        line = command("wpc", *random, "--run-dir", folder, "--max-timesteps", 70)
+        line = command("wpc", "--run-dir", folder, "--max-timesteps", 70)
         run_here(wpc, *line)
     assert_equal_but_for_rounding(whole, plain)
 
 
-def test_a_plain_run_goes_on_compiled(float64, monkeypatch, script):
-    """With Adam's state as the script's own steps have left it."""
-    compile_traced(monkeypatch)
-    args = script.Args(device="cpu")
+@pytest.mark.parametrize("first", [5, 6])
+def test_a_plain_run_goes_on_compiled(float64, traced, script, first):
+    """At any step, with Adam's state as the script's own steps have left it."""
+    args, dataset = script.Args(device="cpu", batch_size=32), random_batch()
     agents = []
     for compiles in (False, True):
         torch.manual_seed(0)
         agent = script.Agent(5, 2, 1.0, args)
-        update = agent.update
-        for step in range(1, 11):
-            if compiles and step == 5:
+        functions = script.Agent.update, script.sample_batch
+        steps = one_by_one(agent, *functions)
+        for step in range(1, first + 6):
+            if compiles and step == first:
                 for name in ("actor", "critic", "value"):  # as in a new process
                     getattr(agent, name, agent.actor).zero_grad()
-                update = compiled.compile_update(agent, script.Agent.update)
-            update(random_batch(), step)
-        agents.append(state(agent))
+                steps = compiled.two_steps_a_call(agent, *functions)
+            steps(dataset, step)
+        agents.append((state(agent), torch.get_rng_state()))
     torch.testing.assert_close(*agents, rtol=1e-9, atol=1e-12)
 
 
@@ -245,33 +260,27 @@ def test_the_script_that_is_named_is_run(tmp_path):
     assert process.returncode == 0 and "My own, and a constraint" in process.stdout
 
 
-@pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize("device", ["cpu", "cuda:1"])
 def test_what_a_script_does_otherwise(monkeypatch, script, device):
-    """On a CPU the update alone; on a GPU sampling, too, which gets the dataset."""
+    """A step gets the dataset, as it samples itself."""
     done = []
 
     class Agent:
         args = types.SimpleNamespace(device=device)
         update = script.Agent.update
 
-    def graphs(agent, update, sample_batch):
+    def make_steps(agent, update, sample_batch):
         assert sample_batch is script.sample_batch
         return lambda dataset, step: done.append((update, dataset, step))
 
-    def compile_update(agent, update):
-        return lambda batch, step: done.append((update, batch, step))
-
     module = types.SimpleNamespace(**vars(script) | {"Agent": Agent})
-    monkeypatch.setattr(compiled, "Graphs", graphs if device == "cuda" else None)
-    cpu = compile_update if device == "cpu" else None
-    monkeypatch.setattr(compiled, "compile_update", cpu)
+    for name, own in {"two_steps_a_call": "cpu", "Graphs": "cuda:1"}.items():
+        monkeypatch.setattr(compiled, name, make_steps if device == own else None)
     compiled.install(module)
-    rewards = types.SimpleNamespace(is_cuda=True) if device == "cuda" else torch.ones(9)
-    dataset = {"rewards": rewards}
-    batch = module.sample_batch(dataset, 4)
-    Agent().update(batch, 7)
-    assert done == [(script.Agent.update, batch, 7)]
-    assert batch is dataset if device == "cuda" else len(batch["rewards"]) == 4
+    dataset = {"rewards": torch.ones(9)}
+    assert module.sample_batch(dataset, 4) is dataset
+    Agent().update(dataset, 7)
+    assert done == [(script.Agent.update, dataset, 7)]
 
 
 class PretendGraph:
@@ -336,7 +345,7 @@ def test_graphs_on_a_gpu_do_the_scripts_steps(monkeypatch, script):
 
 
 def test_the_benchmark_runs_the_scripts(script):
-    assert benchmark.Steps(benchmark.script_steps(script, compiled=False)).run(2) > 0
+    assert benchmark.Steps(benchmark.script_steps(script)).run(2) > 0
 
 
 def test_the_benchmark_compiles_what_it_calls_compiled(monkeypatch):
@@ -345,9 +354,10 @@ def test_the_benchmark_compiles_what_it_calls_compiled(monkeypatch):
         monkeypatch.setattr(benchmark, name, lambda: None)
     monkeypatch.setattr(
         benchmark,
-        "compile_update",
-        lambda agent, update: lambda batch, step: updates.append(update),
+        "two_steps_a_call",
+        lambda agent, update, sample: lambda dataset, step: updates.append(update),
     )
+    monkeypatch.setattr(benchmark, "d3rlpy", None)
     made = benchmark.variants(benchmark.Args(), threads=1)
     for script in SCRIPTS.values():
         made[f"compiled {script.__name__}.py"].step(1)
@@ -392,7 +402,7 @@ def test_the_bare_products_are_those_of_wpc():
             step(i)
         return counter.get_total_flops()
 
-    bare, ours = benchmark.product_steps(), benchmark.script_steps(wpc, False)
+    bare, ours = benchmark.product_steps(), benchmark.script_steps(wpc)
     assert products(bare, 1) == products(ours, 1)
     # The gradient of Q1's parameters of the policy's loss, which nothing needs
     unused = 2 * 256 * (14 * 256 + 256 * 256 + 256)
@@ -410,6 +420,36 @@ def test_a_peer_is_measured_on_the_cpu(tmp_path):
         "        assert len(buffer.sample(batch_size)) == 5\n"
     )
     assert benchmark.Steps(benchmark.peer_steps(tmp_path / "peer.py")).run(2) > 0
+
+
+OLDER = {
+    "two_steps_a_call": """
+def two_steps_a_call(agent, update, sample_batch):
+    return lambda dataset, step: update(agent, sample_batch(dataset, 256), step)
+""",
+    "compile_update": """
+def compile_update(agent, update):
+    return lambda batch, step: update(agent, batch, step)
+""",
+}
+
+
+@pytest.mark.parametrize("text", OLDER.values(), ids=OLDER)
+def test_an_older_tool_is_measured(monkeypatch, tmp_path, text):
+    folder = tmp_path / "tests/tools"
+    folder.mkdir(parents=True)
+    (folder / "compiled.py").write_text(text)
+    for name in ("textbook_steps", "product_steps"):
+        monkeypatch.setattr(benchmark, name, lambda: None)
+    monkeypatch.setattr(benchmark, "d3rlpy", None)
+    made = benchmark.variants(benchmark.Args(older=tmp_path), threads=1)
+    for script in SCRIPTS.values():
+        assert made[f"compiled {script.__name__}.py, older"].run(2) > 0
+
+
+def test_d3rlpy_is_measured():
+    pytest.importorskip("d3rlpy")
+    assert benchmark.Steps(benchmark.d3rlpy_steps()).run(2) > 0
 
 
 def test_the_benchmarks_table(monkeypatch, capsys):

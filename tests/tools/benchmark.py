@@ -4,12 +4,13 @@ matrix products of a step, and other people's files.
 
     python tests/tools/benchmark.py
     python tests/tools/benchmark.py --peers TD3_BC/TD3_BC.py wPC/TD3_wBC.py \\
-        --jax JAX-CORL/algos/td3bc.py
+        --jax JAX-CORL/algos/td3bc.py --older OLD_CHECKOUT
 
 The second line also measures files of github.com/sfujim/TD3_BC, github.com/qsa-fox/wPC
-and github.com/nissymori/JAX-CORL, which you download yourself; the last needs jax,
-flax, optax, omegaconf and pydantic. All variants take turns, so that other load
-slows all of them alike. The table has ratios of medians, and the medians.
+and github.com/nissymori/JAX-CORL, which you download yourself, and compiled.py of an
+older checkout; JAX-CORL needs jax, flax, optax, omegaconf and pydantic. d3rlpy's
+TD3PlusBC is measured where d3rlpy is installed. All variants take turns, so that other
+load slows all of them alike. The table has ratios of medians, and the medians.
 """
 
 import os
@@ -24,8 +25,13 @@ import torch
 import torch.nn.functional as F
 import tyro
 from check_steps import load
-from compiled import compile_update
+from compiled import two_steps_a_call
 from tqdm import trange
+
+try:
+    import d3rlpy
+except ImportError:
+    d3rlpy = None
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import td3_bc
@@ -46,13 +52,32 @@ class Args:
     """other files to measure, with a class TD3_BC as TD3_BC.py has it"""
     jax: Path | None = None
     """JAX-CORL's td3bc.py"""
+    older: Path | None = None
+    """an older checkout, whose compiled.py is measured with the scripts of this one"""
 
 
-def script_steps(script, compiled):
+def plain(agent, update, sample_batch):
+    return lambda dataset, step: update(agent, sample_batch(dataset, BATCH), step)
+
+
+def compiled_by(checkout):
+    """How an older checkout's compiled.py makes an agent's steps."""
+    tool = load(checkout / "tests/tools/compiled.py")
+    if hasattr(tool, "two_steps_a_call"):
+        return tool.two_steps_a_call
+
+    def make_steps(agent, update, sample_batch):
+        compiled = tool.compile_update(agent, update)
+        return lambda dataset, step: compiled(sample_batch(dataset, BATCH), step)
+
+    return make_steps
+
+
+def script_steps(script, make_steps=plain):
     """A script's own sampling and update."""
     args = script.Args(device="cpu")
     agent = script.Agent(STATE_DIM, ACTION_DIM, 1.0, args)
-    update = compile_update(agent, script.Agent.update) if compiled else agent.update
+    steps = make_steps(agent, script.Agent.update, script.sample_batch)
     dataset = {
         "observations": torch.randn(ROWS, STATE_DIM),
         "actions": torch.rand(ROWS, ACTION_DIM) * 2 - 1,
@@ -60,7 +85,7 @@ def script_steps(script, compiled):
         "next_observations": torch.randn(ROWS, STATE_DIM),
         "terminals": torch.zeros(ROWS, 1),
     }
-    return lambda i: update(script.sample_batch(dataset, BATCH), i)
+    return lambda i: steps(dataset, i)
 
 
 class Buffer:
@@ -82,6 +107,17 @@ def peer_steps(path):
     peer.device = torch.device("cpu")  # as the scripts, also where there is a GPU
     agent = peer.TD3_BC(STATE_DIM, ACTION_DIM, 1.0)
     return lambda i: agent.train(buffer, BATCH)
+
+
+def d3rlpy_steps():
+    """The loop of TD3PlusBC.fit, without its log."""
+    observations, actions, _, rewards, terminals = Buffer().arrays
+    timeouts = np.arange(1, ROWS + 1) % 1000 == 0
+    columns = [np.float32(x) for x in (observations, actions, rewards, 0 * terminals)]
+    dataset = d3rlpy.dataset.MDPDataset(*columns, np.float32(timeouts))
+    agent = d3rlpy.algos.TD3PlusBCConfig(batch_size=BATCH).create(device="cpu")
+    agent.build_with_dataset(dataset)
+    return lambda i: agent.update(dataset.sample_transition_batch(BATCH))
 
 
 JAX = """
@@ -248,9 +284,14 @@ def variants(args, threads):
     made = {"textbook": Steps(textbook_steps()), "products": Steps(product_steps())}
     for script in (wpc, td3_bc, wbc):
         name = script.SCRIPT.name
-        made[name] = Steps(script_steps(script, compiled=False))
-        made[f"compiled {name}"] = Steps(script_steps(script, compiled=True))
+        made[name] = Steps(script_steps(script))
+        made[f"compiled {name}"] = Steps(script_steps(script, two_steps_a_call))
+        if args.older:
+            steps = script_steps(script, compiled_by(args.older))
+            made[f"compiled {name}, older"] = Steps(steps)
     made |= {path.name: Steps(peer_steps(path)) for path in args.peers}
+    if d3rlpy:
+        made["d3rlpy's TD3PlusBC"] = Steps(d3rlpy_steps())
     if args.jax:
         made["JAX-CORL"] = JaxSteps(args.jax, threads, True)
         made["JAX-CORL, no LayerNorm"] = JaxSteps(args.jax, threads, False)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""Runs a script with every training step as one graph, which is faster.
+"""Runs a script with its training steps as graphs, which is faster.
 
     python tests/tools/compiled.py wpc.py --env hopper-medium-v2 --alpha 2.5
 
 Arguments, run folder and checkpoints are the script's, and a run may go on with this
-tool or without it. On a CPU, `Agent.update` is compiled by torch.compile, which needs a
-C++ compiler and takes about a minute the first time; results agree with the script's
-but for rounding. On a GPU, sampling and update are captured as CUDA graphs, and results
-should be the same to the last bit. Scripts may be edited, but `update` must do the same
-in all steps that policy_freq divides, and the same in all others.
+tool or without it. On a CPU, two steps are compiled as one, which needs a C++ compiler
+and takes about a minute the first time; results agree with the script's but for
+rounding. On a GPU, sampling and update are captured as CUDA graphs, and results should
+be the same to the last bit. Scripts may be edited, but `update` must do the same in all
+steps that policy_freq divides, and the same in all others.
 """
 
 import copy
@@ -54,49 +54,65 @@ class TraceableAdam:
     @torch.no_grad()
     def step(self):
         beta1, beta2 = self.betas
-        self.beta1_power *= beta1
-        self.beta2_power *= beta2
+        self.beta1_power.mul_(beta1)
+        self.beta2_power.mul_(beta2)
         step_size = self.lr / (1 - self.beta1_power)
         bias_correction = 1 - self.beta2_power
         for parameter, state in zip(self.parameters, self.states, strict=True):
             m, v, gradient = state["exp_avg"], state["exp_avg_sq"], parameter.grad
-            state["step"] += 1
+            state["step"].add_(1)
             m.lerp_(gradient, 1 - beta1)
             v.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
             parameter -= step_size * m / ((v / bias_correction).sqrt() + self.eps)
 
 
-def gathered(other_weight):
-    """A script's `other_weight`: torch.compile fails on an index by randperm."""
+def two_steps_a_call(agent, update, sample_batch):
+    """A function that does every other step, with the one before it, as one graph.
 
-    def with_gather(weight, advantage, batch, args):
-        if args.weight == "random":
-            permutation = torch.randperm(len(weight), device=weight.device)
-            return weight.gather(0, permutation[:, None])
-        return other_weight(weight, advantage, batch, args)
-
-    return with_gather
-
-
-def compile_update(agent, update):
-    """`update` on the agent, each step one graph, with the same random numbers."""
+    From the second call on, TorchDynamo, which looks at each input, is left out.
+    """
     torch._dynamo.config.trace_autograd_ops = True  # lets backward() into the graph
-    twin = copy.copy(agent)  # with the same networks and state of the optimizers
-    optimizers = {k: x for k, x in vars(agent).items() if k.endswith("_optimizer")}
-    for name, optimizer in optimizers.items():
-        setattr(twin, name, TraceableAdam(optimizer))
+    args, twin = agent.args, copy.copy(agent)  # with the same networks and states
+    optimizers, waiting, found, calls = [], [], [], {}
+    for name, part in vars(agent).items():
+        if name.endswith("_optimizer"):
+            optimizers.append(TraceableAdam(part))
+            setattr(twin, name, optimizers[-1])
 
-    def one_step(batch, step):
-        metrics = update(twin, batch, step)
-        for name in optimizers:  # the critics' gradients of the policy's loss, too,
-            getattr(twin, name).zero_grad()  # which then need not be computed
+    def do(dataset, steps):
+        metrics = {}
+        for step in steps:
+            metrics |= update(twin, sample_batch(dataset, args.batch_size), step)
+        for optimizer in optimizers:  # the critics' gradients of the policy's loss,
+            optimizer.zero_grad()  # too, which then need not be computed
         return {name: metric.detach() for name, metric in metrics.items()}
 
-    options = {"cpp_wrapper": True, "fallback_random": True}
-    compiled = torch.compile(one_step, fullgraph=True, dynamic=False, options=options)
-    # One graph for the steps that update the policy, one for all the others.
-    freq = agent.args.policy_freq
-    return lambda batch, step: compiled(batch, 1 if step % freq else freq)
+    def inductor(graph, examples):
+        options = {"cpp_wrapper": True, "fallback_random": True}
+        compiled = torch._inductor.compile(graph, examples, options)
+
+        def call(*inputs):
+            found[:] = compiled, inputs
+            return compiled(*inputs)
+
+        return call
+
+    def one_step(dataset, step):
+        waiting.append(1 if step % args.policy_freq else args.policy_freq)
+        evaluated = step % args.eval_freq == 0 or step == args.max_timesteps
+        if len(waiting) == 1:
+            return do(dataset, [waiting.pop()]) if evaluated else {}
+        steps = waiting.pop(0), waiting.pop()
+        if steps in calls:
+            compiled, inputs, names = calls[steps]
+            return dict(zip(names, compiled(*inputs), strict=True))
+        print("the first steps are compiled, which may take a minute", flush=True)
+        traced = torch.compile(do, backend=inductor, fullgraph=True, dynamic=False)
+        metrics = traced(dataset, steps)
+        calls[steps] = *found, list(metrics)
+        return metrics
+
+    return one_step
 
 
 # --- GPU: CUDA graphs -----------------------------------------------------------------
@@ -133,9 +149,8 @@ class Graphs:
         return metrics
 
     def capture(self, kind, dataset, step):
-        optimizers = [
-            x for x in vars(self.agent).values() if isinstance(x, torch.optim.Adam)
-        ]
+        parts = vars(self.agent).values()
+        optimizers = [x for x in parts if isinstance(x, torch.optim.Adam)]
         for optimizer in optimizers:
             optimizer.param_groups[0]["capturable"] = True
         self.graphs[kind] = torch.cuda.CUDAGraph()
@@ -151,24 +166,15 @@ class Graphs:
 def install(script):
     """From here on, agents of this script (a module) do their steps as graphs."""
     update, sample_batch, steps = script.Agent.update, script.sample_batch, {}
-    if hasattr(script, "other_weight"):
-        script.other_weight = gathered(script.other_weight)
 
-    def compiled_update(agent, batch, step):
-        if agent not in steps and agent.args.device.startswith("cuda"):
-            steps[agent] = Graphs(agent, update, sample_batch)
-        elif agent not in steps:
-            print("the first steps are compiled, which may take a minute", flush=True)
-            steps[agent] = compile_update(agent, update)
-        return steps[agent](batch, step)
+    def compiled_update(agent, dataset, step):
+        if agent not in steps:
+            kind = Graphs if agent.args.device.startswith("cuda") else two_steps_a_call
+            steps[agent] = kind(agent, update, sample_batch)
+        return steps[agent](dataset, step)
 
-    def sample(dataset, batch_size):
-        """On a GPU the dataset itself, as sampling is a part of the graph."""
-        if dataset["rewards"].is_cuda:
-            return dataset
-        return sample_batch(dataset, batch_size)
-
-    script.Agent.update, script.sample_batch = compiled_update, sample
+    script.Agent.update = compiled_update
+    script.sample_batch = lambda dataset, _: dataset  # sampling is a part of the steps
 
 
 def main():
@@ -178,9 +184,7 @@ def main():
     try:
         os.makedirs(cache, exist_ok=True)
     except OSError as error:
-        sys.exit(
-            f"set TORCHINDUCTOR_CACHE_DIR to a folder that can be written: {error}"
-        )
+        sys.exit(f"set TORCHINDUCTOR_CACHE_DIR to a folder to write to: {error}")
     sys.path.insert(0, str(Path(sys.argv[1]).resolve().parent))
     script = importlib.import_module(Path(sys.argv[1]).stem)
     install(script)
@@ -188,14 +192,10 @@ def main():
     try:
         script.main()
     except torch._dynamo.exc.BackendCompilerFailed as error:
-        inductor = torch._inductor.exc
-        expected = inductor.InvalidCxxCompiler, inductor.CppCompileError
-        if not isinstance(error.inner_exception, expected):
+        reason = type(error.inner_exception).__name__
+        if reason not in ("InvalidCxxCompiler", "CppCompileError"):
             raise
-        reason = str(error).split("\n")[0]
-        sys.exit(
-            f"{reason}: compiling needs a C++ compiler; python {sys.argv[0]} works"
-        )
+        sys.exit(f"compiling needs a C++ compiler; python {sys.argv[0]} needs none")
 
 
 if __name__ == "__main__":
