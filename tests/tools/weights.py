@@ -4,7 +4,7 @@
     python tests/tools/weights.py exponential --out wpc_exponential.py
     python wpc_exponential.py --env hopper-medium-v2
 
-The copy is a script like wpc.py, and the other tools take it, too.
+The copy is a script like wpc.py, and compiled.py takes it, too.
 
 - exponential: wPC-e. The weight is exp(A / beta) (eq. 8) with the paper's beta = 1 and
   A = Q - V. Without a limit, exp would overflow: IQL's is 100.
