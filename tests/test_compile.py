@@ -425,10 +425,12 @@ def test_a_peer_is_measured_on_the_cpu(tmp_path):
 
 OLDER = {
     "two_steps_a_call": """
+TraceableAdam = None
 def two_steps_a_call(agent, update, sample_batch):
     return lambda dataset, step: update(agent, sample_batch(dataset, 256), step)
 """,
     "compile_update": """
+TraceableAdam = None
 def compile_update(agent, update):
     return lambda batch, step: update(agent, batch, step)
 """,

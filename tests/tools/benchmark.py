@@ -62,7 +62,7 @@ def plain(agent, update, sample_batch):
 
 def compiled_by(checkout):
     """How an older checkout's compiled.py makes an agent's steps."""
-    tool = load(checkout / "tests/tools/compiled.py")
+    tool = load(checkout / "tests/tools/compiled.py", "TraceableAdam")
     if hasattr(tool, "two_steps_a_call"):
         return tool.two_steps_a_call
 
@@ -103,7 +103,7 @@ class Buffer:
 
 def peer_steps(path):
     """The training step of a file that has the class TD3_BC."""
-    peer, buffer = load(path), Buffer()
+    peer, buffer = load(path, "TD3_BC"), Buffer()
     peer.device = torch.device("cpu")  # as the scripts, also where there is a GPU
     agent = peer.TD3_BC(STATE_DIM, ACTION_DIM, 1.0)
     return lambda i: agent.train(buffer, BATCH)

@@ -99,22 +99,22 @@ def largest_difference(peer, script, steps, v_before=False):
     )
 
 
-def load(path):
-    """The file as a module. Exits with a sentence if it is not one with TD3_BC."""
+def load(path, name):
+    """The file as a module. Exits with a sentence if it has not what is named."""
     if not path.is_file():
         sys.exit(f"{path} is no file")
     spec = importlib.util.spec_from_file_location(path.stem, path)
     peer = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(peer)
-    if not hasattr(peer, "TD3_BC"):
-        sys.exit(f"{path} has no class TD3_BC")
+    if not hasattr(peer, name):
+        sys.exit(f"{path} has no {name}")
     return peer
 
 
 def main(args: Args):
     torch.set_default_dtype(torch.float64)
     for path in args.files:
-        peer = load(path)
+        peer = load(path, "TD3_BC")
         is_wpc = hasattr(peer.TD3_BC(*DIMS), "vnet")
         script = wpc if is_wpc else td3_bc
         difference = largest_difference(peer, script, args.steps)

@@ -40,10 +40,10 @@ class TraceableAdam:
                 state["step"] = torch.tensor(0.0, dtype=torch.float32, device=device)
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
-        # Multiplied as in `step`, as beta**t differs by rounding, and in float64
+        # In float64, as in `step`; without an axis, PyTorch 2.13 loses compiled changes
         t = int(self.states[0]["step"])
         self.beta1_power, self.beta2_power = (
-            torch.tensor(math.prod([beta] * t), dtype=torch.float64, device=device)
+            torch.tensor([math.prod([beta] * t)], dtype=torch.float64, device=device)
             for beta in self.betas
         )
 
@@ -56,8 +56,8 @@ class TraceableAdam:
         beta1, beta2 = self.betas
         self.beta1_power.mul_(beta1)
         self.beta2_power.mul_(beta2)
-        step_size = self.lr / (1 - self.beta1_power)
-        bias_correction = 1 - self.beta2_power
+        step_size = (self.lr / (1 - self.beta1_power)).type_as(self.parameters[0])
+        bias_correction = (1 - self.beta2_power).type_as(self.parameters[0])
         for parameter, state in zip(self.parameters, self.states, strict=True):
             m, v, gradient = state["exp_avg"], state["exp_avg_sq"], parameter.grad
             state["step"].add_(1)
