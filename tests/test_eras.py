@@ -283,7 +283,7 @@ def test_scripts_and_tools_find_them_from_another_folder(tmp_path, monkeypatch):
     env, path = "eras:Hopper-before-3.5-v5", tmp_path / "hopper.hdf5"
     tools = ROOT / "tests/tools"
     line = [sys.executable, tools / "make_dataset.py", "--env", env, "--random"]
-    process = run(*line, "--steps", 60, "--workers", 1, "--out", path, cwd=tmp_path)
+    process = run(*line, "--steps", 60, "--out", path, cwd=tmp_path)
     assert process.returncode == 0 and f"--env {env}" in process.stdout, process.stderr
     line = [sys.executable, ROOT / "wpc.py", "--env", env, "--dataset", path]
     line += ["--max-timesteps", 2, "--eval-episodes", 2, "--run-dir", "run"]
