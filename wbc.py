@@ -387,6 +387,8 @@ def read_dataset(path, state_dim, action_dim, max_action):
     try:
         with h5py.File(path) as file:
             for key in widths:
+                if isinstance(file.get(key), h5py.Group):
+                    raise TypeError(f"{key} is a group of {', '.join(file[key])}")
                 if key in file or key != "next_observations":  # all others must be
                     arrays[key] = np.c_[np.float32(file[key][:])]  # (N,) to (N, 1)
     except Exception as error:  # h5py raises nearly any type where a file is damaged

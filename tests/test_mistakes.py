@@ -138,7 +138,7 @@ DATASETS = [
     ],
     (
         lambda a: a.update({"actions/arm": a.pop("actions"), "actions/leg": 1}),
-        UNREADABLE.replace("[...]", "Accessing a group is done with bytes [...]"),
+        UNREADABLE.replace("[...]", "actions is a group of arm, leg"),
     ),
     (
         lambda a: a.update({"rewards": 1.0}),
