@@ -366,7 +366,7 @@ def download_dataset(task):
     folder = os.environ.get("D4RL_DATASET_DIR", "~/.d4rl/datasets")
     path = Path(folder, name).expanduser()
     for server in D4RL_SERVERS:
-        if path.exists():  # since this server or another process had it
+        if path.exists():  # downloaded just now, or by another process
             break
         try:
             print("downloading from", server)
@@ -400,7 +400,7 @@ def read_dataset(path, state_dim, action_dim, max_action):
             for key in widths:
                 if isinstance(file.get(key), h5py.Group):
                     raise TypeError(f"{key} is a group of {', '.join(file[key])}")
-                if key in file or key != "next_observations":  # all others must be
+                if key in file or key != "next_observations":  # the others must be
                     arrays[key] = np.c_[np.float32(file[key][:])]  # (N,) to (N, 1)
     except Exception as error:  # h5py raises nearly any type where a file is damaged
         raise UserError(
@@ -510,7 +510,7 @@ def resume(path, agent, identity):
     for name, state in checkpoint["agent"].items():
         getattr(agent, name).load_state_dict(state)
     torch.manual_seed(identity["seed"] + checkpoint["step"])  # a GPU draws new numbers
-    torch.set_rng_state(checkpoint["rng_state"])  # a CPU goes on as it was
+    torch.set_rng_state(checkpoint["rng_state"])  # a CPU uses the saved ones
     return checkpoint
 
 
@@ -536,7 +536,7 @@ def set_up(args):
     dataset, mean, std, best_return = prepare_dataset(arrays, args)
     print(
         f"{path} has {len(dataset['rewards']):,} transitions, "
-        f"{dataset['terminals'].sum():.0f} of them terminal, with actions up to "
+        f"{dataset['terminals'].sum():,.0f} of them terminal, with actions up to "
         f"{dataset['actions'].abs().max():.4g} where --env {args.env} allows "
         f"{max_action:g}; alpha is {args.alpha:g}"
     )

@@ -53,23 +53,6 @@ def test_a_notebooks_cell_and_another_machines_mujoco_gl(script):
 # Damage
 
 
-def damaged(content, kind):
-    half = len(content) // 2
-    damages = {"empty": b"", "cut short": content[:half], "another's": b"text" * half}
-    return damages[kind]
-
-
-@pytest.mark.parametrize("kind", ["empty", "cut short", "another's"])
-def test_a_damaged_checkpoint_stops_the_run_and_stays(run_dir, kind):
-    content = (run_dir / "checkpoint.pt").read_bytes()
-    (run_dir / "checkpoint.pt").write_bytes(damaged(content, kind))
-    before = files(run_dir)
-    line = command("wpc", "--run-dir", run_dir, "--max-timesteps", 80)
-    sentence = f"{run_dir / 'checkpoint.pt'} is damaged: choose another --run-dir"
-    assert refusal(wpc, *line) == sentence
-    assert files(run_dir) == before
-
-
 def test_nothing_in_a_checkpoint_is_run(tmp_path):
     class Malicious:
         def __reduce__(self):
@@ -163,19 +146,3 @@ def test_ctrl_c_ends_without_a_traceback(monkeypatch, capsys, script):
     assert stop.value.code == "stopped"
     run_dir = "runs/hopper-medium-v2__"
     assert capsys.readouterr().out.startswith(f"to continue, add --run-dir '{run_dir}")
-
-
-# Divergence
-
-
-def test_a_diverged_run_keeps_the_last_checkpoint(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)  # where MuJoCo logs that the actions are NaN
-    line = command("wpc", "--critic-lr", "1e30", "--run-dir", tmp_path / "run")
-    sentence = refusal(wpc, *line)
-    assert sentence.startswith("diverged by step 30: ") and "'q': nan" in sentence
-    checkpoint = load(tmp_path / "run")
-    assert checkpoint["step"] == 0 and len(checkpoint["evaluations"]) == 1
-    for network in ("actor", "critic", "value"):
-        parameters = checkpoint["agent"][network].values()
-        assert all(parameter.isfinite().all() for parameter in parameters)
-    assert "step 30" not in capsys.readouterr().out

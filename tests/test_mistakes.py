@@ -5,6 +5,7 @@ The sentences are as the user reads them, but for {path}, the dataset or the fol
 fault, and for "[...]", which stands for words of a library's own.
 """
 
+import json
 import re
 
 import h5py
@@ -16,6 +17,8 @@ from conftest import (
     command,
     d4rl_arrays,
     files,
+    load,
+    read_rows,
     refusal,
     run_here,
     wpc,
@@ -271,13 +274,20 @@ def test_runs_that_differ(monkeypatch, run_dir, tmp_path, name, arguments, diffe
     assert files(run_dir) == before
 
 
-@pytest.mark.parametrize("damage", [lambda x: b"", lambda x: x[: len(x) // 2]])
-def test_a_damaged_checkpoint(run_dir, damage):
-    path = run_dir / "checkpoint.pt"
-    path.write_bytes(damage(path.read_bytes()))
+def damaged(content, kind):
+    half = len(content) // 2
+    damages = {"empty": b"", "cut short": content[:half], "another's": b"text" * half}
+    return damages[kind]
+
+
+@pytest.mark.parametrize("kind", ["empty", "cut short", "another's"])
+def test_a_damaged_checkpoint_stops_the_run_and_stays(run_dir, kind):
+    content = (run_dir / "checkpoint.pt").read_bytes()
+    (run_dir / "checkpoint.pt").write_bytes(damaged(content, kind))
     before = files(run_dir)
-    shown = refusal(wpc, *command("wpc", "--run-dir", run_dir))
-    assert shown == f"{path} is damaged: choose another --run-dir"
+    line = command("wpc", "--run-dir", run_dir, "--max-timesteps", 80)
+    sentence = f"{run_dir / 'checkpoint.pt'} is damaged: choose another --run-dir"
+    assert refusal(wpc, *line) == sentence
     assert files(run_dir) == before
 
 
@@ -293,6 +303,9 @@ def test_two_processes_in_one_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(wpc, "evaluate", evaluate)
     shown = refusal(wpc, *line)
     assert shown == f"{tmp_path} is used by another process too"
+    assert load(tmp_path)["args"]["seed"] == 1 and load(tmp_path)["step"] == 60
+    assert json.loads((tmp_path / "args.json").read_text())["seed"] == 1
+    assert len(read_rows(tmp_path)) == 3
 
 
 def test_a_finished_run(run_dir, capsys):
@@ -301,8 +314,15 @@ def test_a_finished_run(run_dir, capsys):
     assert line in capsys.readouterr().out.splitlines()
 
 
-def test_training_that_diverges(monkeypatch, tmp_path):
+def test_a_diverged_run_keeps_the_last_checkpoint(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)  # where MuJoCo logs that the actions are NaN
-    shown = refusal(wpc, *command("wpc", "--critic-lr", "1e30", "--run-dir", "run"))
-    sentence = "diverged by step 30: [...]; the last checkpoint is kept"
-    assert matches(sentence, shown), shown
+    line = command("wpc", "--critic-lr", "1e30", "--run-dir", tmp_path / "run")
+    sentence = refusal(wpc, *line)
+    expected = "diverged by step 30: [...]'q': nan[...]; the last checkpoint is kept"
+    assert matches(expected, sentence), sentence
+    checkpoint = load(tmp_path / "run")
+    assert checkpoint["step"] == 0 and len(checkpoint["evaluations"]) == 1
+    for network in ("actor", "critic", "value"):
+        parameters = checkpoint["agent"][network].values()
+        assert all(parameter.isfinite().all() for parameter in parameters)
+    assert "step 30" not in capsys.readouterr().out

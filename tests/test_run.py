@@ -393,22 +393,6 @@ def test_either_of_mean_and_std_tells_other_data(run_dir, name):
     assert "has another dataset: choose" in refusal(wpc, *line)
 
 
-def test_two_runs_that_start_in_one_folder_at_once(tmp_path, monkeypatch):
-    """The second to save finds the other's checkpoint, and leaves all as it is."""
-    real_evaluate, line = wpc.evaluate, command("wpc", "--run-dir", tmp_path)
-
-    def evaluate(*arguments):
-        monkeypatch.setattr(wpc, "evaluate", real_evaluate)
-        run_here(wpc, *line, "--seed", 1)
-        return real_evaluate(*arguments)
-
-    monkeypatch.setattr(wpc, "evaluate", evaluate)
-    assert f"{tmp_path} is used by another process" in refusal(wpc, *line)
-    assert load(tmp_path)["args"]["seed"] == 1 and load(tmp_path)["step"] == 60
-    assert json.loads((tmp_path / "args.json").read_text())["seed"] == 1
-    assert len(read_rows(tmp_path)) == 3
-
-
 def test_a_continued_run_draws_other_numbers_on_a_gpu(run_dir, monkeypatch):
     """There, the generator starts from a seed, which must not be the first one."""
     seeds, real_seed = [], torch.manual_seed
@@ -441,23 +425,6 @@ def test_a_run_of_a_gpu_goes_on_without_one(run_dir):
     torch.save(checkpoint, run_dir / "checkpoint.pt")
     run_here(wpc, *command("wpc", "--run-dir", run_dir, "--max-timesteps", 61))
     assert load(run_dir)["step"] == 61
-
-
-CONTRADICTIONS = [
-    ("wpc", ["--seed", 1], "has another seed: choose"),
-    ("wpc", ["--alpha", 1.0], "has another alpha: choose"),
-    ("wpc", ["--batch-size", 32], "has another batch_size: choose"),
-    ("td3_bc", [], "has another value_lr: choose"),
-    ("wbc", [], "has another alpha: choose"),
-]
-
-
-@pytest.mark.parametrize("name, arguments, sentence", CONTRADICTIONS)
-def test_what_contradicts_the_run_is_refused(run_dir, name, arguments, sentence):
-    before, line = files(run_dir), command(name, "--run-dir", run_dir, *arguments)
-    checkpoint = run_dir / "checkpoint.pt"
-    assert f"{checkpoint} {sentence}" in refusal(SCRIPTS[name], *line)
-    assert files(run_dir) == before
 
 
 def test_a_run_of_td3_bc_is_not_for_the_others(tmp_path):
