@@ -4,7 +4,7 @@
 The policy maximises Q, and a constraint draws it to the dataset's actions:
 
     pi = argmax E[lambda * Q(s, pi(s)) - w(s, a) * (pi(s) - a)^2]         (eq. 6)
-    w(s, a) = 1 if a is better than average, Q(s, a) > V(s), else 0       (eq. 7)
+    w(s, a) = 1 if Q(s, a) > V(s), so a is better than average, else 0    (eq. 7)
 
 Equations and Algorithm 1 are those of Peng, Han, Liu and Zhou, "Weighted Policy
 Constraints for Offline Reinforcement Learning", AAAI 2023.
@@ -25,7 +25,6 @@ import time
 import warnings
 from dataclasses import asdict, dataclass
 from datetime import datetime
-from http.client import HTTPException
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from urllib.request import urlopen
@@ -40,21 +39,21 @@ import tyro
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm, trange
 
-os.environ.pop("MUJOCO_GL", None)  # training draws nothing: no OpenGL is needed
+os.environ.pop("MUJOCO_GL", None)  # MuJoCo can't be imported if this doesn't fit here
 import mujoco
 
-SCRIPT = Path(globals().get("__file__", "notebook"))  # a cell there has no file
+SCRIPT = Path(globals().get("__file__", os.devnull))  # devnull: a notebook has no file
 
 
 class UserError(Exception):
-    """What a user can fix, said in one sentence; main() prints it."""
+    """What a user can fix, in one sentence for main(); of arguments, a ValueError."""
 
 
 @dataclass
 class Args:
     # Experiment
     env: str = "hopper-medium-v2"
-    """D4RL task; with --dataset also halfcheetah, hopper, walker2d or a Gymnasium id"""
+    """D4RL task; with --dataset also hopper (D4RL's robot), ... or a Gymnasium id"""
     dataset: str | None = None
     """HDF5 file in D4RL's format; by default the task's, downloaded on first use"""
     seed: int = 0
@@ -92,7 +91,7 @@ class Args:
 
     # Policy constraint
     alpha: float | None = None
-    """how much Q counts; by default 0.1 if --env names medium-expert, otherwise 2.5"""
+    """weight of Q; by default 0.1 if --env names medium-expert, otherwise 2.5"""
 
     def __post_init__(self):
         if self.alpha is None:
@@ -107,6 +106,10 @@ class Args:
             raise ValueError("discount and tau must be between 0 and 1")
         if not (self.dataset or D4RL_TASK.fullmatch(self.env)):
             raise ValueError(f"without --dataset, --env must be {D4RL_TASK.pattern}")
+        try:
+            torch.zeros(1, device=self.device)
+        except (RuntimeError, AssertionError) as error:
+            raise ValueError(f"no --device {self.device} here; cpu works") from error
 
 
 # --- Networks -------------------------------------------------------------------------
@@ -185,7 +188,7 @@ class Agent:
         self.value_optimizer = adam(self.value, args.value_lr)
 
     def update(self, batch, step):
-        """Does one step of Algorithm 1, the first being step 1; returns its metrics.
+        """Does step `step` of Algorithm 1, counted from 1, and returns its metrics.
 
         `batch` holds observations and next_observations (B, state_dim), actions (B,
         action_dim), rewards and terminals (B, 1).
@@ -202,10 +205,10 @@ class Agent:
             a_next = a_next.clamp(-max_action, max_action)
             q1_next, q2_next = self.critic_target(s_next, a_next)
             y = r + args.discount * (1 - done) * torch.min(q1_next, q2_next)
-        assert y.shape == a[..., :1].shape, "rewards and terminals must be (B, 1)"
 
         # Critics: Q1 and Q2 fit the target
         q1, q2 = self.critic(s, a)
+        assert y.shape == q1.shape, "rewards and terminals must be (B, 1)"
         critic_loss = F.mse_loss(q1, y) + F.mse_loss(q2, y)
         self.critic_optimizer.zero_grad()
         critic_loss.backward()
@@ -229,11 +232,11 @@ class Agent:
             # Policy: maximise Q under the constraint
             pi = self.actor(s)
             q_pi = self.critic.q1(s, pi)
-            # The paper divides by mean Q; its authors' code by mean |Q|, which keeps
-            # the sign of the objective where Q is negative.
+            # The paper divides by mean Q, which would minimise Q where it is negative;
+            # its authors' code divides by mean |Q|, as is done here.
             lmbda = args.alpha / q_pi.abs().mean().detach()
-            constraint = (weight * (pi - a) ** 2).mean()  # part of eq. 6
-            actor_loss = -lmbda * q_pi.mean() + constraint
+            constraint = (weight * (pi - a) ** 2).mean()
+            actor_loss = -lmbda * q_pi.mean() + constraint  # eq. 6, to be minimised
             self.actor_optimizer.zero_grad()
             actor_loss.backward()
             self.actor_optimizer.step()
@@ -281,8 +284,8 @@ def d4rl_robot(env):
 def use_d4rl_physics(env):
     """Makes a -v4 robot move as in MuJoCo 2.0, with which D4RL was recorded.
 
-    A capsule then had the mass and inertia of a cylinder: its middle part, half a
-    radius longer at each end.
+    A capsule then had the mass and inertia of a cylinder: as thick, and half a radius
+    longer at each end than the capsule's straight part.
     """
     model = env.unwrapped.model
     spec = mujoco.MjSpec.from_file(env.unwrapped.fullpath)
@@ -295,11 +298,11 @@ def use_d4rl_physics(env):
             geom.pos = capsule.pos
             geom.quat = capsule.quat
             geom.fromto = [np.nan] * 6  # if set, it would override size, pos and quat
-    old_model = spec.compile()
+    cylinders = spec.compile()  # only for its masses: capsules stay where they touch
     for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
-        getattr(model, name)[:] = getattr(old_model, name)
-    # Since 3.5.0 (which is 3005000) a contact's two margins are added; before, the
-    # larger counted. Hopper's are all equal, so halving them is exact.
+        getattr(model, name)[:] = getattr(cylinders, name)
+    # Since 3.5.0 (3005000 here) a contact's two margins are added; before, the larger
+    # counted. Only Hopper has margins, all equal, so halving them is exact.
     if mujoco.mj_version() >= 3005000:
         model.geom_margin /= 2
     mujoco.mj_setConst(model, env.unwrapped.data)  # recompute what masses determine
@@ -318,7 +321,7 @@ def make_envs(env, num_envs):
     if not (
         type(states) is type(actions) is gym.spaces.Box
         and len(states.shape) == len(actions.shape) == 1
-        and np.ptp([-actions.low, actions.high]) == 0  # all bounds are -x or x
+        and np.ptp([-actions.low, actions.high]) == 0  # bounds are -x and x, with one x
         and time_limit
     ):
         raise UserError(
@@ -334,8 +337,8 @@ def evaluate(envs, actor, mean, std, args):
 
     Returns the mean and deviation of the returns and, on D4RL's robots, the score.
     """
-    # Every evaluation starts from the same states, but each seed has its own, as
-    # Gymnasium seeds environment i with seed + i.
+    # Every evaluation has the same start states. Environment i is seeded with this
+    # number + i, so that runs with another --seed have others.
     observations, _ = envs.reset(seed=1000 * (args.seed + 100))
     returns = np.zeros(envs.num_envs)
     running = np.full(envs.num_envs, True)
@@ -366,18 +369,15 @@ def download_dataset(task):
     folder = os.environ.get("D4RL_DATASET_DIR", "~/.d4rl/datasets")
     path = Path(folder, name).expanduser()
     for server in D4RL_SERVERS:
-        if path.exists():  # downloaded just now, or by another process
+        if path.exists():  # from before, just now, or another process
             break
         try:
             print("downloading from", server)
             content = urlopen(server + name, timeout=60).read()
-            h5py.File(io.BytesIO(content)).close()  # fails if it is a login page, say
+            h5py.File(io.BytesIO(content)).close()  # raises if this isn't an HDF5 file
             os.makedirs(path.parent, exist_ok=True)
-            with TemporaryDirectory(dir=path.parent) as own:
-                part = Path(own, name)
-                part.write_bytes(content)
-                os.replace(part, path)
-        except (OSError, HTTPException) as error:
+            write_file(path, content)
+        except Exception as error:  # of many types: no network, no HDF5 file, ...
             print(error)
     if not path.exists():
         raise UserError(
@@ -400,7 +400,7 @@ def read_dataset(path, state_dim, action_dim, max_action):
             for key in widths:
                 if isinstance(file.get(key), h5py.Group):
                     raise TypeError(f"{key} is a group of {', '.join(file[key])}")
-                if key in file or key != "next_observations":  # the others must be
+                if key in file or key != "next_observations":  # only it may be missing
                     arrays[key] = np.c_[np.float32(file[key][:])]  # (N,) to (N, 1)
     except Exception as error:  # h5py raises nearly any type where a file is damaged
         raise UserError(
@@ -431,17 +431,17 @@ def read_dataset(path, state_dim, action_dim, max_action):
 def prepare_dataset(arrays, args):
     """The transitions of the columns that `read_dataset` returns, ready for training.
 
-    Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]); where there
-    are next_observations, which d4rl ignores, these replace o[i + 1]. As in d4rl, rows
-    with a timeout, whose o[i + 1] is in the next episode, and the last row give none.
-    A terminal row stays, whatever its timeout says, as its next state doesn't count.
+    Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]). If there are
+    next_observations, which d4rl ignores, they are taken in place of o[i + 1]. As in
+    d4rl, the last row is left out, and so are rows with a timeout, whose o[i + 1] is in
+    the next episode. If such a row is terminal, it stays: its next state doesn't count.
 
     Returns them by name, float32 tensors (N, width) with normalized states; the mean
     and std, each (state_dim,), that normalize them; and the best discounted return from
     any row to its episode's end, to compare Q with.
     """
     following = np.roll(arrays["observations"], -1, axis=0)
-    arrays = {"next_observations": following} | arrays
+    arrays = {"next_observations": following} | arrays  # the file's own come first
     terminals, timeouts = arrays["terminals"], arrays.pop("timeouts")
     keep = np.flatnonzero(((terminals == 1) | (timeouts == 0))[:-1])
     if not keep.size:
@@ -469,63 +469,63 @@ def sample_batch(dataset, batch_size):
 
 # --- Training -------------------------------------------------------------------------
 
+# What a result depends on: the versions of the packages, and of this file
+VERSIONS = {x.__name__: x.__version__ for x in (torch, gym, mujoco, np)}
+VERSIONS["script_sha256"] = hashlib.sha256(SCRIPT.read_bytes()).hexdigest()
+
 
 def write_file(path, content):
     """Writes `content` (bytes) whole or not at all, even if the power fails."""
-    with open(f"{path}.tmp", "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(file.name, path)
+    with TemporaryDirectory(dir=path.parent) as folder:  # one for each process
+        with open(Path(folder, "part"), "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(file.name, path)
 
 
-def save(run_dir, checkpoint, record):
-    """Writes checkpoint.pt, its evaluations as evaluations.csv, and args.json."""
+def save(run_dir, checkpoint):
+    """Writes checkpoint.pt and, from its contents, evaluations.csv and args.json."""
+    os.makedirs(run_dir, exist_ok=True)
     content, table = io.BytesIO(), io.StringIO()
-    # On a full disk torch.save raises RuntimeError, and writing bytes raises OSError,
-    # of which main() makes a sentence.
+    # To memory first: on a full disk torch.save to a file raises RuntimeError, but
+    # write_file raises OSError, which main() prints.
     torch.save(checkpoint, content)
-    write_file(run_dir / "checkpoint.pt", content.getvalue())
-    rows = checkpoint["evaluations"]  # the first, at step 0, has no losses
-    writer = csv.DictWriter(table, max(rows, key=len), lineterminator="\n")
+    rows = checkpoint["evaluations"]
+    columns = max(rows, key=len)  # the row of step 0 has no losses
+    writer = csv.DictWriter(table, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
+    args = json.dumps(checkpoint["args"] | VERSIONS, indent=2)
+    write_file(run_dir / "checkpoint.pt", content.getvalue())
     write_file(run_dir / "evaluations.csv", table.getvalue().encode())
-    write_file(run_dir / "args.json", json.dumps(record, indent=2).encode())
+    write_file(run_dir / "args.json", args.encode())
 
 
 def resume(path, agent, identity):
     """Puts the agent and the random numbers where the checkpoint at `path` has them.
 
-    Returns the checkpoint; raises UserError if it is of a run of another identity.
+    Returns its evaluations. Raises UserError if its identity is another, which means
+    that other arguments or data would be mixed into the run.
     """
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        began = checkpoint["identity"]
     except Exception as error:  # of many types where a file is damaged
         raise UserError(f"{path} is damaged: choose another --run-dir") from error
-    began = checkpoint["identity"]
     for name in identity | began:
         if identity.get(name) != began.get(name):
             raise UserError(f"{path} has another {name}: choose another --run-dir")
     for name, state in checkpoint["agent"].items():
         getattr(agent, name).load_state_dict(state)
-    torch.manual_seed(identity["seed"] + checkpoint["step"])  # a GPU draws new numbers
-    torch.set_rng_state(checkpoint["rng_state"])  # a CPU uses the saved ones
-    return checkpoint
+    torch.manual_seed(identity["seed"] + checkpoint["step"])  # for a GPU: new numbers
+    torch.set_rng_state(checkpoint["rng_state"])  # for a CPU: the saved state
+    return checkpoint["evaluations"]
 
 
-def last_change(path):
-    """When a file was last written, in nanoseconds; None if it is not there."""
-    return path.stat().st_mtime_ns if path.exists() else None
-
-
-def set_up(args):
-    """The environments, the agent, and what `prepare_dataset` returns."""
+def train(args):
+    """Starts or continues the run in args.run_dir; returns its evaluations, as rows."""
     torch.set_flush_denormal(True)  # a CPU takes far longer for numbers below 1e-38
-    try:
-        torch.zeros(1, device=args.device)
-    except (RuntimeError, AssertionError) as error:
-        raise UserError(f"no --device {args.device} here; cpu works") from error
     envs = make_envs(args.env, args.eval_episodes)
     state_dim = envs.single_observation_space.shape[0]
     action_dim = envs.single_action_space.shape[0]
@@ -537,50 +537,37 @@ def set_up(args):
     print(
         f"{path} has {len(dataset['rewards']):,} transitions, "
         f"{dataset['terminals'].sum():,.0f} of them terminal, with actions up to "
-        f"{dataset['actions'].abs().max():.4g} where --env {args.env} allows "
-        f"{max_action:g}; alpha is {args.alpha:g}"
+        f"{dataset['actions'].abs().max():.4g} (at most {max_action:g}); "
+        f"alpha is {args.alpha:g}"
     )
 
     torch.manual_seed(args.seed)
     agent = Agent(state_dim, action_dim, max_action, args)
-    # Seeded again, wpc.py, td3_bc.py and wbc.py draw the same batches.
-    torch.manual_seed(args.seed)
-    return envs, agent, dataset, mean, std, best_return
+    torch.manual_seed(args.seed)  # again: the other scripts draw the same batches
 
-
-def train(args):
-    """Trains from the start, or continues the run that is in the run folder.
-
-    Returns its evaluations, the rows of evaluations.csv as dictionaries.
-    """
-    envs, agent, dataset, mean, std, best_return = set_up(args)
-    # A run may go on elsewhere, or longer, but not with other arguments or other data,
-    # which mean and std tell, wherever the file is.
+    # What must not change when a run is continued. Data are the same if their mean and
+    # std are: the file may have moved.
     identity = asdict(args) | {"dataset": [mean.tolist(), std.tolist()]}
     for name in ("max_timesteps", "device", "run_dir"):
         del identity[name]
 
-    run_dir, first_step, metrics, evaluations = Path(args.run_dir), 0, {}, []
+    run_dir = Path(args.run_dir)
     path = run_dir / "checkpoint.pt"
-    saved = last_change(path)
-    if saved:
-        checkpoint = resume(path, agent, identity)
-        evaluations = checkpoint["evaluations"]
-        first_step = checkpoint["step"] + 1
+    first_step, evaluations, saved_at = 0, [], None
+    if path.exists():
+        saved_at = path.stat().st_mtime_ns
+        evaluations = resume(path, agent, identity)
+        first_step = evaluations[-1]["step"] + 1
         if first_step > args.max_timesteps:
             print(f"{run_dir} is finished; raise --max-timesteps to train longer")
 
-    os.makedirs(run_dir, exist_ok=True)
-    script = SCRIPT.read_bytes() if SCRIPT.exists() else b""
-    record = asdict(args) | {"script_sha256": hashlib.sha256(script).hexdigest()}
-    record |= {x.__name__: x.__version__ for x in (torch, gym, mujoco, np)}
     writer = SummaryWriter(run_dir, purge_step=first_step)
-    clock = time.perf_counter()
-    clock_step = first_step
+    metrics = {}
+    clock, clock_step = time.perf_counter(), first_step
     for step in trange(first_step, args.max_timesteps + 1, disable=None):
         if step:  # at step 0 only evaluate, to find a broken environment early
             batch = sample_batch(dataset, args.batch_size)
-            metrics |= agent.update(batch, step)
+            metrics |= agent.update(batch, step)  # the policy's stay until its next
         if step % args.eval_freq == 0 or step == args.max_timesteps:
             scalars = {k: x.item() for k, x in metrics.items()}  # waits for the GPU
             speed = (step - clock_step) / (time.perf_counter() - clock)
@@ -588,36 +575,32 @@ def train(args):
             row = {"step": step, **scores, **scalars, "steps_per_second": speed}
             row["best_discounted_return"] = best_return
             if not np.isfinite(list(row.values())).all():
-                raise UserError(
-                    f"diverged by step {step}: {row}; the last checkpoint is kept"
-                )
-            if last_change(path) != saved:
+                raise UserError(f"diverged by step {step}, which isn't saved: {row}")
+            if path.exists() and path.stat().st_mtime_ns != saved_at:
                 raise UserError(f"{run_dir} is used by another process too")
             evaluations.append(row)
+            state = {k: x.state_dict() for k, x in vars(agent).items() if k != "args"}
             checkpoint = {
                 "args": asdict(args),
                 "identity": identity,
                 "step": step,
-                "agent": {
-                    k: x.state_dict() for k, x in vars(agent).items() if k != "args"
-                },
+                "agent": state,
                 "rng_state": torch.get_rng_state(),
                 "evaluations": evaluations,
                 "mean": mean,
                 "std": std,
-                "max_action": agent.actor.max_action,
+                "max_action": max_action,
             }
             for name, value in row.items():
                 writer.add_scalar(name, value, step)
             writer.flush()
-            save(run_dir, checkpoint, record)
-            saved = last_change(path)
+            save(run_dir, checkpoint)
+            saved_at = path.stat().st_mtime_ns
             shown = {"mean_return", "normalized_score", "best_discounted_return", "q"}
             line = ", ".join(f"{k} {x:.1f}" for k, x in row.items() if k in shown)
             tqdm.write(f"step {step:,}: {line}")
             sys.stdout.flush()  # so that a log file is up to date
-            clock = time.perf_counter()
-            clock_step = step
+            clock, clock_step = time.perf_counter(), step
     writer.close()
     return evaluations
 

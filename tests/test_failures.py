@@ -47,7 +47,7 @@ def test_a_notebooks_cell_and_another_machines_mujoco_gl(script):
     variables = environment() | {"MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "osmesa"}
     line = [sys.executable, "-c", "import sys; exec(sys.stdin.read(), {})"]
     process = subprocess.run(line, input=code, env=variables, **options)
-    assert process.stdout.startswith("runs/hopper-medium-v2__notebook__0__20")
+    assert process.stdout.startswith("runs/hopper-medium-v2__null__0__20")
 
 
 # Damage

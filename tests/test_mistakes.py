@@ -53,6 +53,8 @@ ARGUMENTS = [
     (["--env", "hopper-"], NO_TASK),
     (["--env", "ant-medium-v2"], NO_TASK),
     (["--env", "HalfCheetah-v4"], NO_TASK),
+    (["--device", "cuda:77"], "no --device cuda:77 here; cpu works"),
+    (["--device", "gpu"], "no --device gpu here; cpu works"),
 ]
 
 
@@ -76,8 +78,6 @@ STARTS = [
     (["--env", "HalfCheetah-v3"], "The mujoco v2 and v3 [...]"),
     (["--env", "Hopper-v2"], "The mujoco v2 and v3 [...]"),
     (["--env", "CartPole-v1"], "--env CartPole-v1 needs one-dimensional Boxes [...]"),
-    (["--device", "cuda:77"], "no --device cuda:77 here; cpu works"),
-    (["--device", "gpu"], "no --device gpu here; cpu works"),
     (["--dataset", "no.hdf5"], "no.hdf5 can't be read: [...]"),
     (["--run-dir", "file"], "[...]file[...]"),
     (["--run-dir", "file/run"], "[...]file/run[...]"),
@@ -318,7 +318,7 @@ def test_a_diverged_run_keeps_the_last_checkpoint(monkeypatch, capsys, tmp_path)
     monkeypatch.chdir(tmp_path)  # where MuJoCo logs that the actions are NaN
     line = command("wpc", "--critic-lr", "1e30", "--run-dir", tmp_path / "run")
     sentence = refusal(wpc, *line)
-    expected = "diverged by step 30: [...]'q': nan[...]; the last checkpoint is kept"
+    expected = "diverged by step 30, which isn't saved: {[...]'q': nan[...]}"
     assert matches(expected, sentence), sentence
     checkpoint = load(tmp_path / "run")
     assert checkpoint["step"] == 0 and len(checkpoint["evaluations"]) == 1

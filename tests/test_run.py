@@ -276,10 +276,10 @@ def test_stopped_by_ctrl_c_and_continued_as_shown(finished, tmp_path):
 
 @pytest.mark.parametrize("moment", ["before", "after"])
 def test_stopped_while_saving(monkeypatch, finished, tmp_path, moment):
-    def save(run_dir, checkpoint, record):
+    def save(run_dir, checkpoint):
         if checkpoint["step"] == 30 and moment == "before":
             raise KeyboardInterrupt
-        real_save(run_dir, checkpoint, record)
+        real_save(run_dir, checkpoint)
         if checkpoint["step"] == 30:
             raise KeyboardInterrupt
 

@@ -21,7 +21,6 @@ it can't be continued.
 
 import copy
 import functools
-import hashlib
 import importlib
 import multiprocessing
 import os
@@ -34,8 +33,6 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
-import gymnasium as gym
-import mujoco
 import numpy as np
 import torch
 import torch.nn as nn
@@ -319,7 +316,8 @@ class Evaluations:
             rows.append({"step": self.step} | future.result() | row)
             os.makedirs(args.run_dir, exist_ok=True)
             checkpoint["evaluations"] = rows
-            wpc.save(Path(args.run_dir), checkpoint, asdict(args) | self.made_by)
+            checkpoint["args"] |= self.made_by
+            wpc.save(Path(args.run_dir), checkpoint)
         self.pending = []
 
 
@@ -416,8 +414,6 @@ def main():
     on_gpu = options.device == "cuda"
     made_by = {
         "made_by": "tests/tools/together.py",
-        "script_sha256": hashlib.sha256(wpc.SCRIPT.read_bytes()).hexdigest(),
-        **{x.__name__: x.__version__ for x in (torch, gym, mujoco, np)},
         "trained_on": torch.cuda.get_device_name() if on_gpu else "cpu",
         "matrix_products": "tf32" if options.tf32 else "float32",
     }
