@@ -39,21 +39,21 @@ import tyro
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm, trange
 
-os.environ.pop("MUJOCO_GL", None)  # MuJoCo can't be imported if this doesn't fit here
+os.environ.pop("MUJOCO_GL", None)  # where its library is missing, mujoco won't import
 import mujoco
 
-SCRIPT = Path(globals().get("__file__", os.devnull))  # devnull: a notebook has no file
+SCRIPT = Path(globals().get("__file__", os.devnull))  # pasted into a notebook: no file
 
 
 class UserError(Exception):
-    """What a user can fix, in one sentence for main(); of arguments, a ValueError."""
+    """A failure that main() prints as one sentence. Wrong Args raise ValueError."""
 
 
 @dataclass
 class Args:
     # Experiment
     env: str = "hopper-medium-v2"
-    """D4RL task; with --dataset also hopper (D4RL's robot), ... or a Gymnasium id"""
+    """D4RL task; with --dataset also D4RL's robot (hopper, ...) or a Gymnasium id"""
     dataset: str | None = None
     """HDF5 file in D4RL's format; by default the task's, downloaded on first use"""
     seed: int = 0
@@ -287,11 +287,11 @@ def use_d4rl_physics(env):
             geom.pos = capsule.pos
             geom.quat = capsule.quat
             geom.fromto = [np.nan] * 6  # if set, it would override size, pos and quat
-    cylinders = spec.compile()  # only for its masses: capsules stay where they touch
+    cylinders = spec.compile()  # only for its masses: contacts stay the capsules'
     for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
         getattr(model, name)[:] = getattr(cylinders, name)
-    # Since 3.5.0 (3005000 here) a contact's two margins are added; before, the larger
-    # counted. Only Hopper has margins, all equal, so halving them is exact.
+    # Since 3.5.0 (3005000 here) the margins of two geoms in contact are added; before,
+    # the larger counted. Only Hopper has margins, all equal, so halving is exact.
     if mujoco.mj_version() >= 3005000:
         model.geom_margin /= 2
     mujoco.mj_setConst(model, env.unwrapped.data)  # recompute what masses determine
@@ -300,7 +300,8 @@ def use_d4rl_physics(env):
 
 def make_envs(env, num_envs):
     """`num_envs` environments for a task, robot or Gymnasium id, stepped together."""
-    warnings.filterwarnings("ignore", ".*(out of date|settotalmass)")  # v4 is meant
+    # v4 is meant, though out of date; HalfCheetah's file still has settotalmass
+    warnings.filterwarnings("ignore", ".*(out of date|settotalmass)")
     robot = d4rl_robot(env)
     name = robot[0] if robot else env
     wrappers = [use_d4rl_physics] if robot else None
@@ -326,8 +327,8 @@ def evaluate(envs, actor, mean, std, args):
 
     Returns the mean and deviation of the returns and, on D4RL's robots, the score.
     """
-    # Every evaluation has the same start states. Environment i is seeded with this
-    # number + i, so that runs with another --seed have others.
+    # Every evaluation has the same start states. Environment i gets this number + i as
+    # its seed; runs with another --seed get other numbers.
     observations, _ = envs.reset(seed=1000 * (args.seed + 100))
     returns = np.zeros(envs.num_envs)
     running = np.full(envs.num_envs, True)
@@ -358,7 +359,7 @@ def download_dataset(task):
     folder = os.environ.get("D4RL_DATASET_DIR", "~/.d4rl/datasets")
     path = Path(folder, name).expanduser()
     for server in D4RL_SERVERS:
-        if path.exists():  # from before, just now, or another process
+        if path.exists():  # already, or from the server before
             break
         try:
             print("downloading from", server)
@@ -389,7 +390,7 @@ def read_dataset(path, state_dim, action_dim, max_action):
             for key in widths:
                 if isinstance(file.get(key), h5py.Group):
                     raise TypeError(f"{key} is a group of {', '.join(file[key])}")
-                if key in file or key != "next_observations":  # only it may be missing
+                if key in file or key != "next_observations":  # which alone is optional
                     arrays[key] = np.c_[np.float32(file[key][:])]  # (N,) to (N, 1)
     except Exception as error:  # h5py raises nearly any type where a file is damaged
         raise UserError(
@@ -422,15 +423,15 @@ def prepare_dataset(arrays, args):
 
     Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]). If there are
     next_observations, which d4rl ignores, they are taken in place of o[i + 1]. As in
-    d4rl, the last row is left out, and so are rows with a timeout, whose o[i + 1] is in
-    the next episode. If such a row is terminal, it stays: its next state doesn't count.
+    d4rl, the last row and rows with a timeout are left out, even then. A row that is
+    also terminal stays: its next state doesn't count.
 
     Returns them by name, float32 tensors (N, width) with normalized states; the mean
     and std, each (state_dim,), that normalize them; and the best discounted return from
     any row to its episode's end, to compare Q with.
     """
     following = np.roll(arrays["observations"], -1, axis=0)
-    arrays = {"next_observations": following} | arrays  # the file's own come first
+    arrays = {"next_observations": following} | arrays  # the file's own override it
     terminals, timeouts = arrays["terminals"], arrays.pop("timeouts")
     keep = np.flatnonzero(((terminals == 1) | (timeouts == 0))[:-1])
     if not keep.size:
@@ -492,10 +493,10 @@ def save(run_dir, checkpoint):
 
 
 def resume(path, agent, identity):
-    """Puts the agent and the random numbers where the checkpoint at `path` has them.
+    """Loads the checkpoint at `path`: the agent and the state of the random numbers.
 
-    Returns its evaluations. Raises UserError if its identity is another, which means
-    that other arguments or data would be mixed into the run.
+    Its `identity`, which are the arguments and the data, must be this one, or UserError
+    is raised. Returns its evaluations.
     """
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
@@ -507,8 +508,8 @@ def resume(path, agent, identity):
             raise UserError(f"{path} has another {name}: choose another --run-dir")
     for name, state in checkpoint["agent"].items():
         getattr(agent, name).load_state_dict(state)
-    torch.manual_seed(identity["seed"] + checkpoint["step"])  # for a GPU: new numbers
-    torch.set_rng_state(checkpoint["rng_state"])  # for a CPU: the saved state
+    torch.manual_seed(identity["seed"] + checkpoint["step"])  # GPU: not the same again
+    torch.set_rng_state(checkpoint["rng_state"])  # CPU: exactly where it was
     return checkpoint["evaluations"]
 
 
@@ -519,7 +520,6 @@ def train(args):
     state_dim = envs.single_observation_space.shape[0]
     action_dim = envs.single_action_space.shape[0]
     max_action = float(envs.single_action_space.high[0])
-
     path = args.dataset or download_dataset(args.env)
     arrays = read_dataset(path, state_dim, action_dim, max_action)
     dataset, mean, std, best_return = prepare_dataset(arrays, args)
@@ -531,7 +531,8 @@ def train(args):
 
     torch.manual_seed(args.seed)
     agent = Agent(state_dim, action_dim, max_action, args)
-    torch.manual_seed(args.seed)  # again: the other scripts draw the same batches
+    # Seeded again, wpc.py, td3_bc.py and wbc.py draw the same batches.
+    torch.manual_seed(args.seed)
 
     # What must not change when a run is continued. Data are the same if their mean and
     # std are: the file may have moved.
@@ -555,7 +556,7 @@ def train(args):
     for step in trange(first_step, args.max_timesteps + 1, disable=None):
         if step:  # at step 0 only evaluate, to find a broken environment early
             batch = sample_batch(dataset, args.batch_size)
-            metrics |= agent.update(batch, step)  # the policy's stay until its next
+            metrics |= agent.update(batch, step)  # keeps the last policy update's
         if step % args.eval_freq == 0 or step == args.max_timesteps:
             scalars = {k: x.item() for k, x in metrics.items()}  # waits for the GPU
             speed = (step - clock_step) / (time.perf_counter() - clock)
@@ -594,7 +595,7 @@ def train(args):
 
 
 def main():
-    args = tyro.cli(Args, description=__doc__)
+    args = tyro.cli(Args, description=__doc__)  # which prints a ValueError of Args
     print(f"to continue, add --run-dir {args.run_dir!r}")
     try:
         train(args)
