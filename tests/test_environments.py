@@ -203,7 +203,7 @@ gym.register("NotANumber-v0", NotANumber, max_episode_steps=30)
 def test_states_that_are_not_finite_stop_the_run(random_data, tmp_path):
     line = [*command("wpc")[:2], "--env", "NotANumber-v0", *SHORT]
     line += ["--dataset", random_data, "--run-dir", tmp_path / "run"]
-    assert "step 0: " in refusal(wpc, *line)
+    assert "diverged by step 0, " in refusal(wpc, *line)
     assert not (tmp_path / "run/checkpoint.pt").exists()
 
 

@@ -273,11 +273,7 @@ def write_hdf5(path, columns):
     with h5py.File(content, "w") as file:  # in memory, as HDF5 breaks on a full disk
         for key, column in columns.items():
             file.create_dataset(key, data=column, compression="gzip", shuffle=True)
-    try:
-        wpc.write_file(path, content.getvalue())
-    except OSError:
-        Path(f"{path}.tmp").unlink(missing_ok=True)
-        raise
+    wpc.write_file(path, content.getvalue())
 
 
 def write_or_exit(path, columns):
