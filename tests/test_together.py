@@ -5,6 +5,7 @@ import contextlib
 import csv
 import importlib
 import json
+import os
 import pickle
 import shlex
 import sys
@@ -144,6 +145,46 @@ def test_a_row_is_of_as_many_steps_as_it_says(float64, monkeypatch, tmp_path):
         rows = csv.DictReader((tmp_path / str(i) / "evaluations.csv").open())
         steps = [(int(row["step"]), float(row["mean_return"])) for row in rows]
         assert steps == [(step, step) for step in range(0, 61, 20)]
+
+
+def test_evaluations_go_on_beside_training_and_are_written_in_order(
+    monkeypatch, tmp_path
+):
+    """As many at a time as there are processes for all runs."""
+    runs, futures = make_runs(), []
+    for i, args in enumerate(runs.runs):
+        args.run_dir = str(tmp_path / str(i))
+
+    class Pool:
+        def submit(self, *_):
+            futures.append(Future())
+            return futures[-1]
+
+    def end(evaluation):
+        for i, future in enumerate(futures[evaluation * n : (evaluation + 1) * n]):
+            future.set_result({"mean_return": evaluation + i / 10})
+
+    def written(i):
+        path = tmp_path / str(i) / "evaluations.csv"
+        rows = csv.DictReader(path.open()) if path.exists() else []
+        return [(int(row["step"]), float(row["mean_return"])) for row in rows]
+
+    n = len(RUNS)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(3 * n + 1))
+    evaluations = together.Evaluations(runs, Pool(), {})
+    for step in (0, 10, 20):
+        evaluations.begin(step, 1.0)
+    assert len(futures) == 3 * n  # none is waited for
+    end(1)
+    end(0)
+    evaluations.begin(30, 1.0)
+    assert written(n - 1) == [(0, (n - 1) / 10), (10, 1 + (n - 1) / 10)]
+    end(3)
+    end(2)
+    evaluations.end()
+    assert [written(i) for i in range(n)] == [
+        [(10 * k, k + i / 10) for k in range(4)] for i in range(n)
+    ]
 
 
 def test_the_traced_steps_are_the_steps(float64):

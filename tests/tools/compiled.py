@@ -4,14 +4,15 @@
     python tests/tools/compiled.py wpc.py --env hopper-medium-v2 --alpha 2.5
 
 Arguments, run folder and checkpoints are the script's, and a run may go on with this
-tool or without it. On a CPU, two steps are compiled as one, which needs a C++ compiler
-and takes about a minute the first time; results agree with the script's but for
-rounding. On a GPU, sampling and update are captured as CUDA graphs, and results should
-be the same to the last bit. Scripts may be edited, but `update` must do the same in all
-steps that policy_freq divides, and the same in all others.
+tool or without it. Two steps are compiled as one, with their sampling, which takes
+about a minute the first time and, on a CPU, needs a C++ compiler. On a GPU, what is
+compiled is replayed as a CUDA graph. Results agree with the script's but for rounding.
+Scripts may be edited, but `update` must do the same in all steps that policy_freq
+divides, and the same in all others.
 """
 
 import copy
+import functools
 import importlib
 import math
 import os
@@ -21,13 +22,13 @@ from pathlib import Path
 
 import torch
 
-# --- CPU: torch.compile ---------------------------------------------------------------
+# --- Two steps as one -----------------------------------------------------------------
 
 
 class TraceableAdam:
     """Stands in for a torch.optim.Adam, on its state, where torch.compile traces it."""
 
-    def __init__(self, optimizer, device="cpu"):
+    def __init__(self, optimizer):
         group, *others = optimizer.param_groups
         known = type(optimizer) is torch.optim.Adam and not others
         if not known or group["weight_decay"] or group["amsgrad"] or group["maximize"]:
@@ -35,6 +36,7 @@ class TraceableAdam:
         self.parameters = group["params"]
         self.lr, self.betas, self.eps = group["lr"], group["betas"], group["eps"]
         self.states = [optimizer.state[parameter] for parameter in self.parameters]
+        device = self.parameters[0].device
         for parameter, state in zip(self.parameters, self.states, strict=True):
             if not state:  # as Adam begins
                 state["step"] = torch.tensor(0.0, dtype=torch.float32, device=device)
@@ -66,13 +68,28 @@ class TraceableAdam:
             parameter -= step_size * m / ((v / bias_correction).sqrt() + self.eps)
 
 
+def as_cuda_graph(call, device):
+    """The call as a CUDA graph. It is captured here, but not done."""
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.device(device), torch.cuda.graph(graph):
+        values = call()
+
+    def replay():
+        graph.replay()
+        return values  # in the same memory each time
+
+    return replay
+
+
 def two_steps_a_call(agent, update, sample_batch):
     """A function that does every other step, with the one before it, as one graph.
 
-    From the second call on, TorchDynamo, which looks at each input, is left out.
+    From the second call on, TorchDynamo, which looks at each input, is left out, and on
+    a GPU, Python too.
     """
     torch._dynamo.config.trace_autograd_ops = True  # lets backward() into the graph
     args, twin = agent.args, copy.copy(agent)  # with the same networks and states
+    on_gpu = args.device.startswith("cuda")
     optimizers, waiting, found, calls = [], [], [], {}
     for name, part in vars(agent).items():
         if name.endswith("_optimizer"):
@@ -88,7 +105,7 @@ def two_steps_a_call(agent, update, sample_batch):
         return {name: metric.detach() for name, metric in metrics.items()}
 
     def inductor(graph, examples):
-        options = {"cpp_wrapper": True, "fallback_random": True}
+        options = {"cpp_wrapper": not on_gpu, "fallback_random": True}
         compiled = torch._inductor.compile(graph, examples, options)
 
         def call(*inputs):
@@ -104,60 +121,20 @@ def two_steps_a_call(agent, update, sample_batch):
             return do(dataset, [waiting.pop()]) if evaluated else {}
         steps = waiting.pop(0), waiting.pop()
         if steps in calls:
-            compiled, inputs, names = calls[steps]
-            return dict(zip(names, compiled(*inputs), strict=True))
+            call, names = calls[steps]
+            return dict(zip(names, call(), strict=True))
         print("the first steps are compiled, which may take a minute", flush=True)
         traced = torch.compile(do, backend=inductor, fullgraph=True, dynamic=False)
         metrics = traced(dataset, steps)
-        calls[steps] = *found, list(metrics)
+        compiled, inputs = found
+        call = functools.partial(compiled, *inputs)
+        calls[steps] = (
+            as_cuda_graph(call, args.device) if on_gpu else call,
+            list(metrics),
+        )
         return metrics
 
     return one_step
-
-
-# --- GPU: CUDA graphs -----------------------------------------------------------------
-
-
-class Graphs:
-    """Sampling and update on a GPU: first as they are, from then on as CUDA graphs."""
-
-    def __init__(self, agent, update, sample_batch):
-        self.agent, self.update, self.sample_batch = agent, update, sample_batch
-        self.stream = torch.cuda.Stream()  # gradients must stay on the one stream
-        self.graphs, self.metrics, self.seen = {}, {}, 0
-
-    def one_step(self, dataset, step):
-        batch = self.sample_batch(dataset, self.agent.args.batch_size)
-        metrics = self.update(self.agent, batch, step)
-        return {name: metric.detach() for name, metric in metrics.items()}
-
-    def __call__(self, dataset, step):
-        freq = self.agent.args.policy_freq
-        kind = step % freq == 0  # one graph with the policy's update, one without
-        self.seen += 1
-        self.stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(self.stream):
-            if self.seen <= 2 * freq:
-                metrics = self.one_step(dataset, step)
-            else:
-                if kind not in self.graphs:
-                    self.capture(kind, dataset, step)
-                self.graphs[kind].replay()
-                metrics = self.metrics[kind]
-        # Evaluation and checkpoints read on the other stream what this one has written.
-        torch.cuda.current_stream().wait_stream(self.stream)
-        return metrics
-
-    def capture(self, kind, dataset, step):
-        parts = vars(self.agent).values()
-        optimizers = [x for x in parts if isinstance(x, torch.optim.Adam)]
-        for optimizer in optimizers:
-            optimizer.param_groups[0]["capturable"] = True
-        self.graphs[kind] = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self.graphs[kind], stream=self.stream):
-            self.metrics[kind] = self.one_step(dataset, step)
-        for optimizer in optimizers:  # as in the script's own checkpoints
-            optimizer.param_groups[0]["capturable"] = False
 
 
 # --- The script -----------------------------------------------------------------------
@@ -169,8 +146,7 @@ def install(script):
 
     def compiled_update(agent, dataset, step):
         if agent not in steps:
-            kind = Graphs if agent.args.device.startswith("cuda") else two_steps_a_call
-            steps[agent] = kind(agent, update, sample_batch)
+            steps[agent] = two_steps_a_call(agent, update, sample_batch)
         return steps[agent](dataset, step)
 
     script.Agent.update = compiled_update

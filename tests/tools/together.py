@@ -44,7 +44,7 @@ from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torch.overrides import TorchFunctionMode
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from compiled import TraceableAdam
+from compiled import TraceableAdam, as_cuda_graph
 
 import wpc
 
@@ -179,7 +179,7 @@ class Runs:
             network = getattr(agent, name).to(device)
             rate = getattr(agent.args, f"{name}_lr")
             optimizer = torch.optim.Adam(network.parameters(), rate)
-            setattr(agent, f"{name}_optimizer", TraceableAdam(optimizer, device))
+            setattr(agent, f"{name}_optimizer", TraceableAdam(optimizer))
         agent.actor_target = copy.deepcopy(agent.actor)
         agent.critic_target = copy.deepcopy(agent.critic)
         self.mode = ForEachRun([getattr(agent, name).net.flat for name in NETWORKS])
@@ -246,10 +246,7 @@ class Runs:
 
     def capture(self):
         """Makes two compiled steps a CUDA graph, without doing them."""
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            self.two_compiled_steps()
-        self.two_compiled_steps = graph.replay
+        self.two_compiled_steps = as_cuda_graph(self.two_compiled_steps, self.device)
 
     def snapshot(self):
         """Of each run: what to evaluate, its checkpoint, and its row but for scores."""
@@ -299,26 +296,31 @@ class Evaluations:
     def __init__(self, runs, pool, made_by):
         self.runs, self.pool, self.made_by = runs, pool, made_by
         self.rows, self.pending = [[] for _ in runs.runs], []
+        self.most = max(1, len(os.sched_getaffinity(0)) // len(runs.runs))
 
     def begin(self, step, speed):
-        """Begins an evaluation, when the one before has ended."""
-        self.end()
-        self.step = step
+        """Begins an evaluation of all runs, when there are processes for it."""
+        self.end(self.most - 1)
+        jobs = []
         for job, checkpoint, row in self.runs.snapshot():
             job = pickle.dumps(job)  # else each tensor would be an open file
             row["steps_per_second"] = speed
-            self.pending.append((self.pool.submit(evaluate_run, job), checkpoint, row))
+            jobs.append((self.pool.submit(evaluate_run, job), checkpoint, row))
+        self.pending.append((step, jobs))
 
-    def end(self):
-        """Waits for the evaluation that has begun, and writes what it found."""
-        for i, (future, checkpoint, row) in enumerate(self.pending):
-            args, rows = self.runs.runs[i], self.rows[i]
-            rows.append({"step": self.step} | future.result() | row)
-            os.makedirs(args.run_dir, exist_ok=True)
-            checkpoint["evaluations"] = rows
-            checkpoint["args"] |= self.made_by
-            wpc.save(Path(args.run_dir), checkpoint)
-        self.pending = []
+    def end(self, left=0):
+        """Writes what was found, in order; waits until no more than `left` go on."""
+        while self.pending:
+            step, jobs = self.pending[0]
+            if len(self.pending) <= left and not all(x.done() for x, *_ in jobs):
+                break
+            for args, rows, job in zip(self.runs.runs, self.rows, jobs, strict=True):
+                future, checkpoint, row = job
+                rows.append({"step": step} | future.result() | row)
+                checkpoint["evaluations"] = rows
+                checkpoint["args"] |= self.made_by
+                wpc.save(Path(args.run_dir), checkpoint)
+            del self.pending[0]
 
 
 # --- Training -------------------------------------------------------------------------
