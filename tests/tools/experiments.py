@@ -31,6 +31,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from PIL import Image
 from scipy import stats
 
 ROOT = Path(__file__).parents[2]
@@ -430,6 +431,7 @@ def draw(path, panels):
         frameon=False,
     )
     figure.savefig(path, dpi=130)
+    Image.open(path).convert("RGB").quantize(64).save(path)  # a third of the size
     plt.close(figure)
     print(f"wrote {path}")
 
