@@ -38,7 +38,7 @@ import tyro
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm, trange
 
-os.environ.pop("MUJOCO_GL", None)  # where its library is missing, mujoco won't import
+os.environ.pop("MUJOCO_GL", None)  # naming a missing library, it stops mujoco's import
 import mujoco
 
 SCRIPT = Path(globals().get("__file__", os.devnull))  # pasted into a notebook: no file
@@ -269,7 +269,7 @@ def use_d4rl_physics(env):
     for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
         getattr(model, name)[:] = getattr(cylinders, name)
     # Since 3.5.0 (3005000 here) the margins of two geoms in contact are added; before,
-    # the larger counted. Only Hopper has margins, all equal, so halving is exact.
+    # the larger counted. Of the three, only Hopper has any, all equal: halve them.
     if mujoco.mj_version() >= 3005000:
         model.geom_margin /= 2
     mujoco.mj_setConst(model, env.unwrapped.data)  # recompute what masses determine
@@ -278,7 +278,7 @@ def use_d4rl_physics(env):
 
 def make_envs(env, num_envs):
     """`num_envs` environments for a task, robot or Gymnasium id, stepped together."""
-    # v4 is meant, though out of date; HalfCheetah's file still has settotalmass
+    # Both warn: v4, which is meant, is out of date, and HalfCheetah has settotalmass
     warnings.filterwarnings("ignore", ".*(out of date|settotalmass)")
     robot = d4rl_robot(env)
     name = robot[0] if robot else env
@@ -399,10 +399,10 @@ def read_dataset(path, state_dim, action_dim, max_action):
 def prepare_dataset(arrays, args):
     """The transitions of the columns that `read_dataset` returns, ready for training.
 
-    Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]). If there are
-    next_observations, which d4rl ignores, they are taken in place of o[i + 1]. As in
-    d4rl, the last row and rows with a timeout are left out, even then. A row that is
-    also terminal stays: its next state doesn't count.
+    Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]), or the file's
+    next_observations[i] in place of o[i + 1]; d4rl ignores these. Either way, the last
+    row and rows with a timeout are left out, as in d4rl. Unlike in d4rl, a row with a
+    timeout stays if it is terminal, as its next state doesn't count.
 
     Returns them by name, float32 tensors (N, width) with normalized states; the mean
     and std, each (state_dim,), that normalize them; and the best discounted return from
@@ -473,8 +473,8 @@ def save(run_dir, checkpoint):
 def resume(path, agent, identity):
     """Loads the checkpoint at `path`: the agent and the state of the random numbers.
 
-    Its `identity`, which are the arguments and the data, must be this one, or UserError
-    is raised. Returns its evaluations.
+    Raises UserError if its `identity`, the arguments and the data, differs from this
+    run's. Returns its evaluations.
     """
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
@@ -486,7 +486,7 @@ def resume(path, agent, identity):
             raise UserError(f"{path} has another {name}: choose another --run-dir")
     for name, state in checkpoint["agent"].items():
         getattr(agent, name).load_state_dict(state)
-    torch.manual_seed(identity["seed"] + checkpoint["step"])  # GPU: not the same again
+    torch.manual_seed(identity["seed"] + checkpoint["step"])  # GPU: draws new numbers
     torch.set_rng_state(checkpoint["rng_state"])  # CPU: exactly where it was
     return checkpoint["evaluations"]
 
@@ -510,11 +510,11 @@ def train(args):
 
     torch.manual_seed(args.seed)
     agent = Agent(state_dim, action_dim, max_action, args)
-    # Seeded again, wpc.py, td3_bc.py and wbc.py draw the same batches.
+    # Seeded again so that wpc.py, td3_bc.py and wbc.py draw the same batches.
     torch.manual_seed(args.seed)
 
-    # What must not change when a run is continued. Data are the same if their mean and
-    # std are: the file may have moved.
+    # What must not change when a run is continued. Data are the same if their states'
+    # mean and std are: the file may have moved.
     identity = asdict(args) | {"dataset": [mean.tolist(), std.tolist()]}
     for name in ("max_timesteps", "device", "run_dir"):
         del identity[name]
@@ -535,7 +535,7 @@ def train(args):
     for step in trange(first_step, args.max_timesteps + 1, disable=None):
         if step:  # at step 0 only evaluate, to find a broken environment early
             batch = sample_batch(dataset, args.batch_size)
-            metrics |= agent.update(batch, step)  # keeps the last policy update's
+            metrics |= agent.update(batch, step)  # lmbda etc. stay until they are new
         if step % args.eval_freq == 0 or step == args.max_timesteps:
             scalars = {k: x.item() for k, x in metrics.items()}  # waits for the GPU
             speed = (step - clock_step) / (time.perf_counter() - clock)
@@ -574,7 +574,7 @@ def train(args):
 
 
 def main():
-    args = tyro.cli(Args, description=__doc__)  # which prints a ValueError of Args
+    args = tyro.cli(Args, description=__doc__)  # prints ValueErrors of Args
     print(f"to continue, add --run-dir {args.run_dir!r}")
     try:
         train(args)
