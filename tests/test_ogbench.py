@@ -91,7 +91,7 @@ def test_the_transitions_are_ogbenchs(made):
     env, theirs, _ = ogbench.make_env_and_datasets(name, dataset_path=str(path))
     assert env.spec.id == SETS[name][0]
     widths = env.observation_space.shape[0], env.action_space.shape[0]
-    args = wpc.Args(discount=0.9, weight="static")
+    args = wpc.Args(discount=0.9)
     ours, mean, std, best_return = wpc.prepare_dataset(
         wpc.read_dataset(out, *widths, 1.0), args
     )

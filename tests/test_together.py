@@ -25,7 +25,7 @@ DIMS = 5, 2, 1.0
 OPTIONS = {"device": "cpu", "policy_noise": 0.0, "batch_size": 16}
 # Without noise, which is drawn for all runs together.
 OPTIONS |= {"discount": 0.9, "tau": 0.1, "actor_lr": 1e-3, "critic_lr": 1e-4}
-OPTIONS |= {"value_lr": 1e-3, "beta": 0.5}  # of the scripts that have them
+OPTIONS |= {"value_lr": 1e-3}  # of the scripts that have it
 RUNS = [  # with one of two datasets
     (td3_bc, 0, {"alpha": 1.0}),
     (wpc, 1, {"alpha": 2.5}),
