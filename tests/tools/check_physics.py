@@ -173,7 +173,7 @@ def which_physics(columns, env_id, rows=500):
 def main(args: Args):
     robot = args.file.stem.split("_")[0]
     if not args.env and robot not in wpc.D4RL_ROBOTS:
-        sys.exit(f"whose data has {args.file}? Name it as in --env Ant-v5")
+        sys.exit(f"{args.file} names no environment: add one, as in --env Ant-v5")
     try:
         columns = read_columns(args.file)
     except (OSError, KeyError) as error:
