@@ -283,6 +283,15 @@ def test_what_a_script_does_otherwise(monkeypatch, script):
     assert done == [(script.Agent.update, dataset, 7)]
 
 
+def test_thin_products_are_computed_in_the_other_order(traced):
+    do_steps(wpc, wpc.Args(device="cpu", batch_size=32), compiled.two_steps_a_call)
+    assert compiled.decompositions[compiled.MM] is compiled.thin_mm
+    a, thin, wide = torch.randn(40, 50), torch.randn(50, 3), torch.randn(50, 40)
+    torch.testing.assert_close(compiled.thin_mm(a, thin), a @ thin)
+    for others in ((a, wide), (thin.T, thin)):  # as they are
+        assert compiled.thin_mm(*others) is NotImplemented
+
+
 class PretendGraph:
     """Stands in for a CUDA graph: while it is captured, nothing is done, and a replay
     writes its results to the memory that was theirs then."""

@@ -74,7 +74,7 @@ MM = torch.ops.aten.mm.default
 
 def thin_mm(a, b, known=decompositions[MM]):
     """A product with a thin result, as of a first layer's gradient, in the other order:
-    MKL takes two to five times as long for it as for the transposed one."""
+    on an AMD EPYC, MKL then takes a half to a fifth of the time."""
     if b.shape[1] < 32 <= a.shape[0]:
         return torch.mm(b.T, a.T).T
     return known(a, b)
