@@ -33,6 +33,7 @@ from conftest import (
     wpc,
     wpc_with,
 )
+from torch._inductor.decomposition import decompositions
 from torch._inductor.exc import InductorError
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -285,7 +286,7 @@ def test_what_a_script_does_otherwise(monkeypatch, script):
 
 def test_thin_products_are_computed_in_the_other_order(traced):
     do_steps(wpc, wpc.Args(device="cpu", batch_size=32), compiled.two_steps_a_call)
-    assert compiled.decompositions[compiled.MM] is compiled.thin_mm
+    assert decompositions[torch.ops.aten.mm.default] is compiled.thin_mm
     a, thin, wide = torch.randn(40, 50), torch.randn(50, 3), torch.randn(50, 40)
     torch.testing.assert_close(compiled.thin_mm(a, thin), a @ thin)
     for others in ((a, wide), (thin.T, thin)):  # as they are

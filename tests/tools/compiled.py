@@ -21,7 +21,6 @@ import tempfile
 from pathlib import Path
 
 import torch
-from torch._inductor.decomposition import decompositions
 
 # --- Two steps as one -----------------------------------------------------------------
 
@@ -69,16 +68,13 @@ class TraceableAdam:
             parameter -= step_size * m / ((v / bias_correction).sqrt() + self.eps)
 
 
-MM = torch.ops.aten.mm.default
-
-
-def thin_mm(a, b, known=decompositions[MM]):
+def thin_mm(a, b):
     """A product with a thin result, as of a first layer's gradient, in the other order:
     on an AMD EPYC, MKL then takes a half to a fifth of the time. (If you change this,
     empty the compiler's cache, which doesn't notice.)"""
     if b.shape[1] < 32 <= a.shape[0]:
         return torch.mm(b.T, a.T).T
-    return known(a, b)
+    return NotImplemented  # as it is
 
 
 def as_cuda_graph(call, device):
@@ -104,7 +100,9 @@ def two_steps_a_call(agent, update, sample_batch):
     args, twin = agent.args, copy.copy(agent)  # with the same networks and states
     on_gpu = args.device.startswith("cuda")
     if not on_gpu:
-        decompositions[MM] = thin_mm
+        from torch._inductor.decomposition import decompositions  # needs its cache
+
+        decompositions[torch.ops.aten.mm.default] = thin_mm
     optimizers, waiting, found, calls = [], [], [], {}
     for name, part in vars(agent).items():
         if name.endswith("_optimizer"):
