@@ -526,7 +526,7 @@ def train(args):
     print(
         f"{path} has {len(dataset['rewards']):,} transitions, "
         f"{dataset['terminals'].sum():,.0f} of them terminal, with actions up to "
-        f"{dataset['actions'].abs().max():.4g} (at most {max_action:g})"
+        f"{dataset['actions'].abs().max():.4g} ({max_action:g} is allowed)"
     )
 
     torch.manual_seed(args.seed)

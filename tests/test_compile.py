@@ -284,9 +284,18 @@ def test_what_a_script_does_otherwise(monkeypatch, script):
     assert done == [(script.Agent.update, dataset, 7)]
 
 
-def test_thin_products_are_computed_in_the_other_order(traced):
+def test_thin_products_are_computed_in_the_other_order(monkeypatch):
+    mm, used = torch.ops.aten.mm.default, []
+
+    def compile_it(graph, *_):
+        used.append(decompositions[mm])
+        return graph.forward
+
+    monkeypatch.setattr(torch._inductor, "compile", compile_it)
+    torch._dynamo.reset()
     do_steps(wpc, wpc.Args(device="cpu", batch_size=32), compiled.two_steps_a_call)
-    assert decompositions[torch.ops.aten.mm.default] is compiled.thin_mm
+    assert used == [compiled.thin_mm]
+    assert decompositions[mm] is not compiled.thin_mm  # for what others compile
     a, thin, wide = torch.randn(40, 50), torch.randn(50, 3), torch.randn(50, 40)
     torch.testing.assert_close(compiled.thin_mm(a, thin), a @ thin)
     for others in ((a, wide), (thin.T, thin)):  # as they are

@@ -518,12 +518,12 @@ def test_its_scores_on_random_data_are_in_the_runs():
             assert [cell] == (end or [""])
             for run in runs:
                 ratios[script, robot] = run["q"] / run["best_discounted_return"]
-    assert "far below wBC" in RESULTS  # by more than the scores of either vary
-    wpc_last, wbc_last = (
-        tables(script, "walker2d-random")[0]["normalized_score"][-10:]
+    assert "wPC is far below wBC" in RESULTS
+    wpc_end, wbc_end = (
+        tables(script, "walker2d-random")[0]["normalized_score"][-10:].mean()
         for script in ("wpc", "wbc")
     )
-    assert stats.ttest_ind(wbc_last, wpc_last, equal_var=False).pvalue < 0.05
+    assert wpc_end < wbc_end / 5
     assert "to more than 160,000 times the best return" in RESULTS
     assert all(ratios[x, "walker2d"].max() > 160_000 for x in ("wpc", "td3_bc", "wbc"))
     for sentence, script in {

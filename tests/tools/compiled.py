@@ -19,6 +19,7 @@ import os
 import sys
 import tempfile
 from pathlib import Path
+from unittest import mock
 
 import torch
 
@@ -99,10 +100,6 @@ def two_steps_a_call(agent, update, sample_batch):
     torch._dynamo.config.trace_autograd_ops = True  # lets backward() into the graph
     args, twin = agent.args, copy.copy(agent)  # with the same networks and states
     on_gpu = args.device.startswith("cuda")
-    if not on_gpu:
-        from torch._inductor.decomposition import decompositions  # needs its cache
-
-        decompositions[torch.ops.aten.mm.default] = thin_mm
     optimizers, waiting, found, calls = [], [], [], {}
     for name, part in vars(agent).items():
         if name.endswith("_optimizer"):
@@ -119,7 +116,11 @@ def two_steps_a_call(agent, update, sample_batch):
 
     def inductor(graph, examples):
         options = {"cpp_wrapper": not on_gpu, "fallback_random": True}
-        compiled = torch._inductor.compile(graph, examples, options)
+        from torch._inductor.decomposition import decompositions  # needs its cache
+
+        own = {} if on_gpu else {torch.ops.aten.mm.default: thin_mm}
+        with mock.patch.dict(decompositions, own):
+            compiled = torch._inductor.compile(graph, examples, options)
 
         def call(*inputs):
             found[:] = compiled, inputs
