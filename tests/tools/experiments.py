@@ -67,7 +67,8 @@ SYSTEMS = {
 OUR_DATA = {
     "random": "of uniform actions",
     "medium": "of D4RL's policy",
-    "medium-replay": "of our SAC agent (D4RL: 202,000, 402,000 and 302,000)",
+    "medium-replay": "of our SAC agent",
+    "hopper-medium-replay": "of our SAC agent; D4RL's file has 402,000",
     "medium-expert": "of D4RL's medium policy and an expert that is not D4RL's",
 }
 COMPARED = ["wPC", "TD3+BC", "wBC"]
@@ -272,7 +273,8 @@ def score_table(groups, tasks, systems):
         row, whose = [task, "-"], "-"
         if task in data:
             row[1], count = data[task]["mean_score"], int(data[task]["transitions"])
-            whose = f"{count:,}, {OUR_DATA.get(task.partition('-')[2], 'own')}"
+            kind = task.partition("-")[2]
+            whose = f"{count:,}, {OUR_DATA.get(task, OUR_DATA.get(kind, 'own'))}"
         for name in header[2:]:
             group = groups.get((task, name, ""))
             row.append(group.score if group else published(name, task))
