@@ -39,10 +39,10 @@ import tyro
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm, trange
 
-os.environ.pop("MUJOCO_GL", None)  # naming a missing library, it stops mujoco's import
+os.environ.pop("MUJOCO_GL", None)  # if its library is missing, mujoco won't import
 import mujoco
 
-SCRIPT = Path(globals().get("__file__", os.devnull))  # pasted into a notebook: no file
+SCRIPT = Path(globals().get("__file__", os.devnull))  # in a notebook: an empty file
 
 
 class UserError(Exception):
@@ -291,7 +291,7 @@ def use_d4rl_physics(env):
     for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
         getattr(model, name)[:] = getattr(cylinders, name)
     # Since 3.5.0 (3005000 here) the margins of two geoms in contact are added; before,
-    # the larger counted. Of the three, only Hopper has any, all equal: halve them.
+    # the larger counted. Of D4RL's robots only Hopper has any, all equal: halve them.
     if mujoco.mj_version() >= 3005000:
         model.geom_margin /= 2
     mujoco.mj_setConst(model, env.unwrapped.data)  # recompute what masses determine
@@ -300,7 +300,7 @@ def use_d4rl_physics(env):
 
 def make_envs(env, num_envs):
     """`num_envs` environments for a task, robot or Gymnasium id, stepped together."""
-    # Both warn: v4, which is meant, is out of date, and HalfCheetah has settotalmass
+    # Expected warnings: v4 is out of date, and HalfCheetah's model has settotalmass
     warnings.filterwarnings("ignore", ".*(out of date|settotalmass)")
     robot = d4rl_robot(env)
     name = robot[0] if robot else env
@@ -327,8 +327,8 @@ def evaluate(envs, actor, mean, std, args):
 
     Returns the mean and deviation of the returns and, on D4RL's robots, the score.
     """
-    # Every evaluation has the same start states. Environment i gets this number + i as
-    # its seed; runs with another --seed get other numbers.
+    # Every evaluation has the same start states: environment i is seeded with this + i.
+    # Runs with another --seed get others; the 100 is TD3+BC's.
     observations, _ = envs.reset(seed=1000 * (args.seed + 100))
     returns = np.zeros(envs.num_envs)
     running = np.full(envs.num_envs, True)
@@ -390,7 +390,7 @@ def read_dataset(path, state_dim, action_dim, max_action):
             for key in widths:
                 if isinstance(file.get(key), h5py.Group):
                     raise TypeError(f"{key} is a group of {', '.join(file[key])}")
-                if key in file or key != "next_observations":  # which alone is optional
+                if key in file or key != "next_observations":  # the others are required
                     arrays[key] = np.c_[np.float32(file[key][:])]  # (N,) to (N, 1)
     except Exception as error:  # h5py raises nearly any type where a file is damaged
         raise UserError(
@@ -423,8 +423,8 @@ def prepare_dataset(arrays, args):
 
     Row i gives the transition (o[i], a[i], r[i], o[i + 1], terminal[i]), or the file's
     next_observations[i] in place of o[i + 1]; d4rl ignores these. Either way, the last
-    row and rows with a timeout are left out, as in d4rl. Unlike in d4rl, a row with a
-    timeout stays if it is terminal, as its next state doesn't count.
+    row and rows with a timeout are left out, as in d4rl; but a terminal row with a
+    timeout stays, as its next state doesn't count.
 
     Returns them by name, float32 tensors (N, width) with normalized states; the mean
     and std, each (state_dim,), that normalize them; and the best discounted return from
@@ -435,7 +435,7 @@ def prepare_dataset(arrays, args):
     terminals, timeouts = arrays["terminals"], arrays.pop("timeouts")
     keep = np.flatnonzero(((terminals == 1) | (timeouts == 0))[:-1])
     if not keep.size:
-        raise UserError("the dataset has 0 transitions: it needs rows without timeout")
+        raise UserError("the dataset has 0 transitions: it needs rows with no timeout")
     rewards, ends = arrays["rewards"].ravel(), (terminals + timeouts).ravel() > 0
     best_return, return_to_go = -np.inf, 0.0
     for reward, end in zip(rewards[::-1].tolist(), ends[::-1], strict=True):
@@ -495,16 +495,16 @@ def save(run_dir, checkpoint):
 def resume(path, agent, identity):
     """Loads the checkpoint at `path`: the agent and the state of the random numbers.
 
-    Raises UserError if its `identity`, the arguments and the data, differs from this
-    run's. Returns its evaluations.
+    Raises UserError if its `identity` (arguments and data) differs from this run's.
+    Returns its evaluations.
     """
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        began = checkpoint["identity"]
+        saved = checkpoint["identity"]
     except Exception as error:  # of many types where a file is damaged
         raise UserError(f"{path} is damaged: choose another --run-dir") from error
-    for name in identity | began:
-        if identity.get(name) != began.get(name):
+    for name in identity | saved:
+        if identity.get(name) != saved.get(name):
             raise UserError(f"{path} has another {name}: choose another --run-dir")
     for name, state in checkpoint["agent"].items():
         getattr(agent, name).load_state_dict(state)
@@ -520,11 +520,11 @@ def train(args):
     state_dim = envs.single_observation_space.shape[0]
     action_dim = envs.single_action_space.shape[0]
     max_action = float(envs.single_action_space.high[0])
-    path = args.dataset or download_dataset(args.env)
-    arrays = read_dataset(path, state_dim, action_dim, max_action)
+    file = args.dataset or download_dataset(args.env)
+    arrays = read_dataset(file, state_dim, action_dim, max_action)
     dataset, mean, std, best_return = prepare_dataset(arrays, args)
     print(
-        f"{path} has {len(dataset['rewards']):,} transitions, "
+        f"{file} has {len(dataset['rewards']):,} transitions, "
         f"{dataset['terminals'].sum():,.0f} of them terminal, with actions up to "
         f"{dataset['actions'].abs().max():.4g} ({max_action:g} is allowed)"
     )
@@ -534,8 +534,8 @@ def train(args):
     # Seeded again so that wpc.py, td3_bc.py and wbc.py draw the same batches.
     torch.manual_seed(args.seed)
 
-    # What must not change when a run is continued. Data are the same if their states'
-    # mean and std are: the file may have moved.
+    # What must not change when a run is continued. The file may have moved: data with
+    # the same mean and std of states are the same.
     identity = asdict(args) | {"dataset": [mean.tolist(), std.tolist()]}
     for name in ("max_timesteps", "device", "run_dir"):
         del identity[name]
@@ -556,7 +556,7 @@ def train(args):
     for step in trange(first_step, args.max_timesteps + 1, disable=None):
         if step:  # at step 0 only evaluate, to find a broken environment early
             batch = sample_batch(dataset, args.batch_size)
-            metrics |= agent.update(batch, step)  # lmbda etc. stay until they are new
+            metrics |= agent.update(batch, step)  # lmbda etc. keep their last value
         if step % args.eval_freq == 0 or step == args.max_timesteps:
             scalars = {k: x.item() for k, x in metrics.items()}  # waits for the GPU
             speed = (step - clock_step) / (time.perf_counter() - clock)

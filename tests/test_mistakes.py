@@ -133,7 +133,7 @@ WRONG = (
     "{path}: {key} is wrong in {count} row(s), first in row 7 ({value}): numbers must "
     "be finite, terminals and timeouts 0 or 1, and actions from -1 to 1"
 )
-NO_TRANSITIONS = "the dataset has 0 transitions: it needs rows without timeout"
+NO_TRANSITIONS = "the dataset has 0 transitions: it needs rows with no timeout"
 DATASETS = [
     *[
         (without(key), UNREADABLE.replace("[...]", f"[...]'{key}' doesn't exist[...]"))
