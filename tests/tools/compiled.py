@@ -7,7 +7,7 @@ Arguments, run folder and checkpoints are the script's, and a run may go on with
 tool or without it. Two steps are compiled as one, with their sampling, which takes
 about a minute the first time and, on a CPU, needs a C++ compiler. On a GPU, what is
 compiled is replayed as a CUDA graph. Results agree with the script's but for rounding;
-before PyTorch 2.13, batches and noise are drawn in another order, too.
+PyTorch 2.11 also draws batches and noise in another order (2.13 keeps the script's).
 Scripts may be edited, but `update` must do the same in all steps that policy_freq
 divides, and the same in all others.
 """
