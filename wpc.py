@@ -99,8 +99,8 @@ class Args:
         if self.run_dir is None:
             name = f"{Path(self.dataset or self.env).stem}__{SCRIPT.stem}__{self.seed}"
             self.run_dir = f"runs/{name}__{datetime.now():%Y-%m-%d_%H-%M-%S.%f}"
-        counts = self.max_timesteps, self.eval_freq, self.eval_episodes
-        if min(*counts, self.batch_size, self.policy_freq) < 1:
+        counts = self.max_timesteps, self.eval_freq, self.eval_episodes, self.batch_size
+        if min(*counts, self.policy_freq) < 1:
             raise ValueError("steps, frequencies, episodes and batch_size must be >= 1")
         if not (0 <= self.discount <= 1 and 0 <= self.tau <= 1):
             raise ValueError("discount and tau must be between 0 and 1")
@@ -368,14 +368,14 @@ def download_dataset(task):
     """Path of a task's D4RL file, downloaded unless it is in d4rl's folder."""
     name = task.removesuffix("-v2").replace("-", "_") + "-v2.hdf5"
     folder = os.environ.get("D4RL_DATASET_DIR", "~/.d4rl/datasets")
-    path = Path(folder, name).expanduser()
+    path = Path(os.path.expanduser(folder), name)
     for server in D4RL_SERVERS:
         if path.exists():  # already, or from the server before
             break
         try:
             print("downloading from", server)
             content = urlopen(server + name, timeout=60).read()
-            h5py.File(io.BytesIO(content)).close()  # raises if this isn't an HDF5 file
+            h5py.File(io.BytesIO(content))  # raises if this isn't an HDF5 file
             os.makedirs(path.parent, exist_ok=True)
             write_file(path, content)
         except Exception as error:  # of many types: no network, no HDF5 file, ...
@@ -409,10 +409,11 @@ def read_dataset(path, state_dim, action_dim, max_action):
             "actions, rewards, terminals and timeouts (1 where an episode was cut off)"
         ) from error
     for key, column in arrays.items():
-        if column.shape != (len(arrays["rewards"]), widths[key]):
+        shape = len(arrays["rewards"]), widths[key]
+        if column.shape != shape:
             raise UserError(
-                f"{path}: {key} has shape {column.shape}, not (N, {widths[key]}) with "
-                "the same N for all; MATLAB reverses the axes"
+                f"{path}: {key} has shape {column.shape}, not {shape} as the rewards "
+                "and --env require; MATLAB reverses the axes"
             )
         good = np.isfinite(column)
         if key in ("terminals", "timeouts"):
@@ -493,8 +494,8 @@ def save(run_dir, checkpoint):
     # write_file raises OSError, which main() prints.
     torch.save(checkpoint, content)
     rows = checkpoint["evaluations"]
-    columns = max(rows, key=len)  # the row of step 0 has no losses
-    writer = csv.DictWriter(table, columns, lineterminator="\n")
+    # The last row has all columns, that of step 0 no losses.
+    writer = csv.DictWriter(table, rows[-1], lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     args = json.dumps(checkpoint["args"] | VERSIONS, indent=2)
@@ -513,7 +514,7 @@ def resume(path, agent, identity):
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         saved = checkpoint["identity"]
     except Exception as error:  # of many types where a file is damaged
-        raise UserError(f"{path} is damaged: choose another --run-dir") from error
+        raise UserError(f"{path} can't be read: choose another --run-dir") from error
     for name in identity | saved:
         if identity.get(name) != saved.get(name):
             raise UserError(f"{path} has another {name}: choose another --run-dir")
@@ -546,9 +547,8 @@ def train(args):
     # Seeded again so that wpc.py, td3_bc.py and wbc.py draw the same batches.
     torch.manual_seed(args.seed)
 
-    # What must not change when a run is continued. The file may have moved: data with
-    # the same mean and std of states are the same.
-    identity = asdict(args) | {"dataset": [mean.tolist(), std.tolist()]}
+    # What must not change when a run is continued; the data's file may have moved.
+    identity = asdict(args) | {"dataset": [mean.tolist(), std.tolist(), best_return]}
     for name in ("max_timesteps", "device", "run_dir"):
         del identity[name]
 

@@ -103,6 +103,16 @@ def test_no_server_has_the_file(servers, tmp_path, answers):
     assert wpc.download_dataset(TASK).read_bytes() == CONTENT
 
 
+def test_without_a_home_folder(servers, monkeypatch, tmp_path):
+    servers(None, None)
+    monkeypatch.delenv("D4RL_DATASET_DIR")
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)  # raises KeyError
+    monkeypatch.chdir(tmp_path)
+    sentence = refusal(wpc, "python", "wpc.py", "--env", TASK)
+    assert "could not be downloaded: set D4RL_DATASET_DIR to the folder" in sentence
+
+
 def test_two_jobs_that_download_one_file(servers, tmp_path):
     """Each writes a file of its own, so that none finds another's half."""
     servers("slow", None)

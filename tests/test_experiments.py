@@ -173,7 +173,9 @@ def test_a_report_by_hand(tool, tmp_path):
     assert tasks == experiments.TASKS
     assert tables["Table 1"][0]["wPC, paper"] == "19.6"  # also where there are no runs
     hopper, walker = with_runs(tables["Table 1"])
-    assert hopper["the data"] == "-"  # as it is not ours, whose best return is another
+    assert (
+        hopper["data's score"] == "-"
+    )  # as it is not ours, whose best return is another
     assert hopper["task"] == "hopper-medium" and walker["task"] == "walker2d-medium"
     assert hopper["wPC"] == "2.0 ± 1.0 (3; 0.12k)"
     assert hopper["TD3+BC"] == hopper["wBC"] == "4.0 ± 2.0 (3; 0.12k)"
@@ -391,6 +393,15 @@ def test_a_report_without_runs(tmp_path):
     program = [sys.executable, ROOT / "tests/tools/experiments.py"]
     process = run(*program, "report", "--runs", tmp_path)
     assert_one_sentence(process, "holds no run with ten evaluations")
+
+
+def test_a_report_that_can_not_be_written(tmp_path):
+    make_run(tmp_path / "0", "wpc", "hopper_medium", 0, 10)
+    program = [sys.executable, ROOT / "tests/tools/experiments.py"]
+    (tmp_path / "file").touch()
+    out = tmp_path / "file/report"
+    process = run(*program, "report", "--runs", tmp_path, "--out", out)
+    assert_one_sentence(process, "--out can't be written: [Errno 20]")
 
 
 def test_other_weights_and_what_is_drawn(tool, tmp_path, monkeypatch):

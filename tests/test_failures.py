@@ -59,7 +59,7 @@ def test_nothing_in_a_checkpoint_is_run(tmp_path):
             return os.mkdir, (str(tmp_path / "harm"),)
 
     torch.save({"step": Malicious()}, tmp_path / "checkpoint.pt")
-    assert "checkpoint.pt is damaged" in refusal(
+    assert "checkpoint.pt can't be read" in refusal(
         wpc, *command("wpc", "--run-dir", tmp_path)
     )
     assert not (tmp_path / "harm").exists()

@@ -128,7 +128,7 @@ UNREADABLE = (
     "{path} can't be read: [...]; D4RL's format has arrays of observations, actions, "
     "rewards, terminals and timeouts (1 where an episode was cut off)"
 )
-SHAPE = "not (N, {width}) with the same N for all; MATLAB reverses the axes"
+SHAPE = "not ({}, {}) as the rewards and --env require; MATLAB reverses the axes"
 WRONG = (
     "{path}: {key} is wrong in {count} row(s), first in row 7 ({value}): numbers must "
     "be finite, terminals and timeouts 0 or 1, and actions from -1 to 1"
@@ -149,31 +149,35 @@ DATASETS = [
     ),
     (
         replaced("actions", lambda x: x[:-1]),
-        "{path}: actions has shape (39, 6), " + SHAPE.format(width=6),
+        "{path}: actions has shape (39, 6), " + SHAPE.format(40, 6),
     ),
     (
         replaced("timeouts", lambda x: x[:-2]),
-        "{path}: timeouts has shape (38, 1), " + SHAPE.format(width=1),
+        "{path}: timeouts has shape (38, 1), " + SHAPE.format(40, 1),
     ),
     (
         replaced("observations", lambda x: x[:, :11]),
-        "{path}: observations has shape (40, 11), " + SHAPE.format(width=17),
+        "{path}: observations has shape (40, 11), " + SHAPE.format(40, 17),
     ),
     (
         replaced("actions", lambda x: x.T),
-        "{path}: actions has shape (6, 40), " + SHAPE.format(width=6),
+        "{path}: actions has shape (6, 40), " + SHAPE.format(40, 6),
     ),
     (
         every(lambda x: np.atleast_2d(x.T)),
-        "{path}: observations has shape (17, 40), " + SHAPE.format(width=17),
+        "{path}: observations has shape (17, 40), " + SHAPE.format(1, 17),
+    ),
+    (
+        replaced("rewards", lambda x: x[:-1]),
+        "{path}: observations has shape (40, 17), " + SHAPE.format(39, 17),
     ),
     (
         replaced("rewards", lambda x: np.stack([x, x], 1)),
-        "{path}: rewards has shape (40, 2), " + SHAPE.format(width=1),
+        "{path}: rewards has shape (40, 2), " + SHAPE.format(40, 1),
     ),
     (
         lambda a: a.update(next_observations=a["observations"][:-1]),
-        "{path}: next_observations has shape (39, 17), " + SHAPE.format(width=17),
+        "{path}: next_observations has shape (39, 17), " + SHAPE.format(40, 17),
     ),
     *[
         (with_value(key, value), WRONG.replace("{key}", key).replace("{value}", shown))
@@ -286,7 +290,7 @@ def test_a_damaged_checkpoint_stops_the_run_and_stays(run_dir, kind):
     (run_dir / "checkpoint.pt").write_bytes(damaged(content, kind))
     before = files(run_dir)
     line = command("wpc", "--run-dir", run_dir, "--max-timesteps", 80)
-    sentence = f"{run_dir / 'checkpoint.pt'} is damaged: choose another --run-dir"
+    sentence = f"{run_dir / 'checkpoint.pt'} can't be read: choose another --run-dir"
     assert refusal(wpc, *line) == sentence
     assert files(run_dir) == before
 

@@ -668,6 +668,19 @@ def test_an_empty_dataset(tmp_path, make):
     assert refusal_of(from_minari.main, args) == "test/made-v0 is empty"
 
 
+@pytest.mark.parametrize("name", ["observations", "rewards"])
+def test_minaris_numbers_must_be_finite(tmp_path, make, name):
+    broken = {"observations": np.zeros((4, 3), np.float32), "rewards": [0.0] * 3}
+    broken[name][-1] = broken[name][-1] * np.nan
+    name_of_set, out = make(buffer(0, 3, **broken)), tmp_path / "data.hdf5"
+    args = from_minari.Args(name_of_set, out, "Pendulum-v1")
+    sentence = refusal_of(from_minari.main, args)
+    assert (
+        sentence == f"test/made-v0 has {name} that are not finite, which can't be used"
+    )
+    assert not out.exists()
+
+
 def test_a_dataset_is_downloaded(monkeypatch):
     monkeypatch.setattr(minari, "load_dataset", lambda name, download: (name, download))
     name = "mujoco/hopper/medium-v0"

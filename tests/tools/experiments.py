@@ -265,7 +265,7 @@ def known_data(groups):
 
 def score_table(groups, tasks, systems):
     """Our scores, beside them those that were published, and whose data are ours."""
-    header, rows, data = ["task", "the data"], [], known_data(groups)
+    header, rows, data = ["task", "data's score"], [], known_data(groups)
     for system in systems:
         header.append(system)
         header += [source for source in PUBLISHED if source.startswith(f"{system},")]
@@ -334,16 +334,15 @@ def q_table(groups):
     header = [*header.split(", "), "seeds over 1", "back", "score"]
     rows = []
     for group in groups.values():
-        if not group.best_return > 0:
-            continue
-        ratio = group.q / group.best_return
-        end, largest = ratio[:, -10:].mean(axis=1), ratio.max(axis=1)
-        over = largest > 1
         arguments = group.others or (f"alpha {group.alpha}" if group.alpha else "")
-        row = [group.task, group.system, arguments, group.size, span(end, ".2f")]
-        row += [span(largest, ".2f"), span(group.steps[ratio.argmax(axis=1)], ",.0f")]
-        row += [str(over.sum()), str((over & (end < 1)).sum())]
-        rows.append([*row, mean_and_std(group.last_ten())])
+        row, cells = [group.task, group.system, arguments, group.size], ["-"] * 5
+        if group.best_return > 0:
+            ratio = group.q / group.best_return
+            end, largest = ratio[:, -10:].mean(axis=1), ratio.max(axis=1)
+            steps, over = group.steps[ratio.argmax(axis=1)], largest > 1
+            cells = [span(end, ".2f"), span(largest, ".2f"), span(steps, ",.0f")]
+            cells += [str(over.sum()), str((over & (end < 1)).sum())]
+        rows.append([*row, *cells, mean_and_std(group.last_ten())])
     return markdown(header, rows)
 
 
@@ -444,8 +443,8 @@ INTRODUCTION = """\
 Scores are D4RL's normalized ones, or returns where a task is called "(mean return)". A
 score is the mean of a run's last ten evaluations; over seeds: mean ± sample standard
 deviation (seeds; training steps). What the paper and CORL have published is of D4RL's
-own files. "The data" is the mean score of the episodes trained on and "whose data" the
-number of transitions and whom they are of, where the report knows them
+own files. The data's score is the mean of the episodes trained on; "whose data" are the
+number of transitions and whom they are of, where the report knows it
 (tests/results/datasets.csv). Runs whose arguments differ from the scripts' defaults are
 in the table on Q alone.
 """
@@ -474,7 +473,10 @@ def report(runs: Path = Path("runs"), out: Path = Path("report")):
     groups = read_groups(runs)
     if not groups:
         sys.exit(f"{runs} holds no run with ten evaluations: run what `list` prints")
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        sys.exit(f"--out can't be written: {error}")
 
     def tasks_of(*systems, at_least=1):
         tasks = dict.fromkeys(task for task, _, _ in groups)

@@ -258,6 +258,11 @@ def main(args):
     dataset = open_dataset(args.dataset)
     check_spaces(dataset)
     columns = convert(dataset)
+    for name, column in columns.items():
+        if not np.isfinite(column).all():
+            sys.exit(
+                f"{dataset.id} has {name} that are not finite, which can't be used"
+            )
     env = choose_env(dataset, args.env, columns["actions"])
     columns["actions"] = clip(columns["actions"], env, args.clip)
     write_or_exit(args.out, columns)

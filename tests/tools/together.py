@@ -256,7 +256,8 @@ class Runs:
             networks.copy_to(i, self.actor.net)
             actor = copy.deepcopy(self.actor)
             _, mean, std, best_return = self.data[i]
-            identity = asdict(args) | {"dataset": [mean.tolist(), std.tolist()]}
+            data = [mean.tolist(), std.tolist(), best_return]
+            identity = asdict(args) | {"dataset": data}
             identity["made_by"] = "together.py"  # so that no script goes on
             for name in ("max_timesteps", "device", "run_dir"):
                 del identity[name]
