@@ -461,8 +461,8 @@ def save(run_dir, checkpoint):
     # write_file raises OSError, which main() prints.
     torch.save(checkpoint, content)
     rows = checkpoint["evaluations"]
-    columns = max(rows, key=len)  # the row of step 0 has no losses
-    writer = csv.DictWriter(table, columns, lineterminator="\n")
+    # Not all rows have all columns: that of step 0 has no losses.
+    writer = csv.DictWriter(table, max(rows, key=len), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     args = json.dumps(checkpoint["args"] | VERSIONS, indent=2)
