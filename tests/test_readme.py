@@ -534,6 +534,26 @@ def test_what_surprises_in_the_paper_is_in_the_runs():
     (run,) = tables("wpc", "hopper-random")
     score = run["normalized_score"]
     jumps = f"jumping between {score.min():.1f} and {score.max():.1f}"
+    score, ratio = end_of("wpc-static", "walker2d-medium")
+    assert rows_with("the static weight fails") == [
+        f"{score} after 300,000 steps, with a rising Q"
+    ]
+    (run,) = tables("wpc-static", "walker2d-medium")
+    q = run["q"] / run["best_discounted_return"]
+    assert q.argmax() == len(q) - 1 and run["step"][-1] == 300_000
+    early = f"{q[:15].max():.2f}"
+    assert q[15:25].max() < float(early)
+    sentence = (
+        f"rose to {early} of the best discounted return of the data, fell, and rose"
+    )
+    assert f"{sentence} again to {ratio:.2f} at the last step" in RESULTS
+    score, ratio = end_of("wpc-random", "walker2d-medium")
+    td3_bc = scores("td3_bc", "walker2d-medium")[1][:, -10:].mean()
+    assert rows_with("wPC-rnd 59.3, below") == [
+        f"{score} after 300,000 steps, and {td3_bc:.1f}"
+    ]
+    assert tables("wpc-random", "walker2d-medium")[0]["step"][-1] == 300_000
+    assert f"random weight's stayed below {np.ceil(100 * ratio) / 100:.2f}" in RESULTS
     assert rows_with("wPC 19.9") == [f"{end_of('wpc', 'hopper-random')[0]}, {jumps}"]
 
 
