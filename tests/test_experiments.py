@@ -218,6 +218,22 @@ def test_a_report_by_hand(tool, tmp_path):
     assert figures(tmp_path / "report") == {"figure2", "figure3", "figure4"}
 
 
+def test_q_that_rises_at_the_last_step_is_not_back(tool, tmp_path):
+    make_run(tmp_path / "0", "wpc", "hopper_medium", 0, 10, q=[4.0] * 11 + [11.0])
+    _, tables = report(tool, tmp_path, tmp_path / "report")
+    (row,) = tables["When does Q run away?"]
+    assert (row["seeds over 1"], row["back"]) == ("1", "0")
+
+
+def test_where_all_returns_are_negative_q_has_no_measure(tool, tmp_path):
+    path = make_run(tmp_path / "0", "wpc", "mine", 0, 10, batch_size=16)
+    table = (path / "evaluations.csv").read_text().replace("10.0,", "-1.0,")
+    (path / "evaluations.csv").write_text(table)
+    _, tables = report(tool, tmp_path, tmp_path / "report")
+    (row,) = tables["When does Q run away?"]
+    assert row["arguments"] == "batch_size 16" and row["largest Q"] == "-"
+
+
 def test_runs_of_unequal_length(tool, tmp_path):
     """A cell counts to where its shortest run ends, a difference to where both do."""
     shorter, longer = range(10, 110, 10), range(5, 205, 5)

@@ -341,7 +341,7 @@ def q_table(groups):
             end, largest = ratio[:, -10:].mean(axis=1), ratio.max(axis=1)
             steps, over = group.steps[ratio.argmax(axis=1)], largest > 1
             cells = [span(end, ".2f"), span(largest, ".2f"), span(steps, ",.0f")]
-            cells += [str(over.sum()), str((over & (end < 1)).sum())]
+            cells += [str(over.sum()), str((over & (ratio[:, -1] < 1)).sum())]
         rows.append([*row, *cells, mean_and_std(group.last_ten())])
     return markdown(header, rows)
 
@@ -443,8 +443,8 @@ INTRODUCTION = """\
 Scores are D4RL's normalized ones, or returns where a task is called "(mean return)". A
 score is the mean of a run's last ten evaluations; over seeds: mean ± sample standard
 deviation (seeds; training steps). What the paper and CORL have published is of D4RL's
-own files. The data's score is the mean of the episodes trained on; "whose data" are the
-number of transitions and whom they are of, where the report knows it
+own files. The data's score is the mean of the episodes trained on; "whose data" gives
+the number of transitions and whom they are of, where the report knows it
 (tests/results/datasets.csv). Runs whose arguments differ from the scripts' defaults are
 in the table on Q alone.
 """
@@ -457,7 +457,7 @@ NOTES = {
     "When does Q run away?": "Q (its mean over a batch) divided by the best discounted "
     "return-to-go of the data, from the lowest to the highest seed: the mean "
     "of the last ten evaluations, the largest and its step; how many seeds had it over "
-    "1, and with how many of these it came back below.",
+    "1, and with how many of these it was below at the last step.",
     "TD3+BC here and on D4RL's files": "Mean score of all evaluations to this step, "
     "and Welch's p. The published curves are tests/results/td3_bc_on_d4rl.csv.",
 }
