@@ -590,7 +590,7 @@ def test_what_it_says_of_the_other_weights_is_in_the_runs():
 
 def test_what_it_says_of_q_on_random_data_is_in_the_runs():
     systems = ("wpc", "td3_bc", "wbc")
-    sentence = "Q is away at the end, step 500,000, at more than 350,000 times the best"
+    sentence = "Q has run away by step 500,000, to more than 350,000 times the best"
     assert sentence in RESULTS
     for system in systems:
         (run,) = tables(system, "walker2d-random")
