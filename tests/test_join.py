@@ -114,7 +114,7 @@ SECOND = {
     "next": (columns(1, with_next=True), "all with next_observations or all without"),
     "width": (without("", observations=np.zeros((20, 17))), "observations (17 wide)"),
     "the same": (columns(0), "hold the same data: name them once"),
-    "short": (without("", rewards=np.zeros(19)), "the same N for all"),
+    "short": (without("", rewards=np.zeros(19)), "as the rewards and --env require"),
     "reversed": (without("", actions=np.zeros((3, 21))), "MATLAB reverses the axes"),
     "255": (without("", terminals=np.full(20, 255)), "terminals is wrong in 20"),
     "text": (without("", rewards="none"), "can't be read"),
