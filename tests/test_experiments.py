@@ -173,9 +173,8 @@ def test_a_report_by_hand(tool, tmp_path):
     assert tasks == experiments.TASKS
     assert tables["Table 1"][0]["wPC, paper"] == "19.6"  # also where there are no runs
     hopper, walker = with_runs(tables["Table 1"])
-    assert (
-        hopper["data's score"] == "-"
-    )  # as it is not ours, whose best return is another
+    # It is not our data, whose best return is another.
+    assert hopper["data's score"] == "-"
     assert hopper["task"] == "hopper-medium" and walker["task"] == "walker2d-medium"
     assert hopper["wPC"] == "2.0 ± 1.0 (3; 0.12k)"
     assert hopper["TD3+BC"] == hopper["wBC"] == "4.0 ± 2.0 (3; 0.12k)"

@@ -619,6 +619,8 @@ def test_what_it_says_against_itself_is_in_the_runs():
     assert "TD3+BC and wBC are ahead of wPC on two of the three tasks" in RESULTS
     score, _ = end_of("bc", "halfcheetah-medium-replay")
     assert f"on *halfcheetah-medium-replay*, {score} after 200,000 steps" in RESULTS
+    score, _ = end_of("wbc", "walker2d-medium-replay")
+    assert f"So is wBC's seed on *walker2d-medium-replay*, {score}." in RESULTS
     ends = scores("wbc", "hopper-medium-replay")[1][:, -10:].mean(axis=1)
     assert f"are far apart, {ends[0]:.1f} and {ends[1]:.1f}." in RESULTS
     lead = [
@@ -646,9 +648,11 @@ def test_its_speeds_on_a_gpu_are_in_the_runs():
         for x in ("plain", "compiled")
     )
     speeds = plain["steps_per_second"][1:]
-    sentence = f"made {speeds.min():.0f} to {speeds.max():.0f} steps a second"
-    assert sentence in RESULTS
-    assert f"it made {compiled['steps_per_second'][-1]:,.0f}." in RESULTS
+    slow, fast = f"{speeds.min():.0f}", f"{speeds.max():.0f}"
+    quick = f"{compiled['steps_per_second'][-1]:,.0f}"
+    assert f"made {slow} to {fast} steps a second, without evaluation." in RESULTS
+    assert f"it made {quick}." in RESULTS
+    assert f"| {slow} to {fast}/s, " in README and f"| {quick}/s, " in README
     for robot in ("walker2d", "halfcheetah", "hopper"):
         runs = []
         for path in (ROOT / "tests/results/runs").glob(f"*__{robot}-*__*"):
@@ -668,6 +672,23 @@ def test_its_table_of_alpha_is_in_the_runs():
             for cell in (score, f"{ratio:.2f}")
         ]
         assert f"\n| {robot}-medium-expert | {' | '.join(cells)} |\n" in RESULTS
+
+
+def test_its_experts_scores_are_those_of_their_data():
+    """Of the medium-expert data's episodes, those that are not the medium data's."""
+    with (ROOT / "tests/results/datasets.csv").open() as file:
+        rows = {row["task"]: row for row in csv.DictReader(file)}
+    for robot in ("HalfCheetah", "Hopper", "Walker2d"):
+        both, medium = (
+            (int(row["episodes"]), float(row["mean_score"]))
+            for kind in ("medium-expert", "medium")
+            for row in [rows[f"{robot.lower()}-{kind}"]]
+        )
+        expert = (both[0] * both[1] - medium[0] * medium[1]) / (both[0] - medium[0])
+        score = re.search(
+            rf"^\| {robot} \| (?:SAC|TQC), .* \| ([\d.]+) \|$", RESULTS, re.M
+        )
+        assert abs(float(score[1]) - expert) < 0.2  # of rounded means
 
 
 def test_its_replay_data_of_hopper_is_as_small_as_it_says():
@@ -709,8 +730,6 @@ def test_its_hours_are_those_of_the_measured_speeds():
     assert hours == f"{least:.1f} to {most:.1f} hours"
     count = 1e6 / int(compiled.replace(",", "")) / 60
     assert minutes == f"{count:.0f} minutes without evaluation"
-    assert f"made {slow} to {fast} steps a second, without evaluation." in RESULTS
-    assert f"it made {compiled}." in RESULTS
 
 
 def test_what_it_says_of_the_zoos_agents_is_in_its_table():
