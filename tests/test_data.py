@@ -277,7 +277,7 @@ def test_actions_at_the_bounds_are_fine(tmp_path):
     dataset, *_ = load_dataset(path, max_action=2.0)
     assert len(dataset["actions"]) == 38
     assert dataset["actions"].abs().max() == pytest.approx(2.001)
-    with pytest.raises(wpc.UserError, match=r"actions from -1 to 1"):
+    with pytest.raises(wpc.UserError, match=r"actions within \+-1\.0"):
         load_dataset(tmp_path / "data.hdf5", max_action=1.0)
 
 

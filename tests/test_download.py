@@ -110,7 +110,7 @@ def test_without_a_home_folder(servers, monkeypatch, tmp_path):
     monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)  # raises KeyError
     monkeypatch.chdir(tmp_path)
     sentence = refusal(wpc, "python", "wpc.py", "--env", TASK)
-    assert "could not be downloaded: set D4RL_DATASET_DIR to the folder" in sentence
+    assert "is missing: give a --dataset, or set D4RL_DATASET_DIR" in sentence
 
 
 def test_two_jobs_that_download_one_file(servers, tmp_path):

@@ -42,7 +42,7 @@ def constant_actor(action):
     with torch.no_grad():
         for parameter in actor.parameters():
             parameter.zero_()
-        actor.net[4].bias += np.arctanh(action)
+        actor[4].bias += np.arctanh(action)
     return actor
 
 

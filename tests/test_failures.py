@@ -31,7 +31,7 @@ from wpc import UserError
 
 
 def test_the_bounds_themselves_are_fine(script):
-    script.Args(discount=0, tau=0, max_timesteps=1, eval_episodes=1)
+    script.Args(discount=0, tau=0, max_timesteps=0, eval_episodes=1)
     script.Args(discount=1, tau=1, eval_freq=1, batch_size=1, policy_freq=1)
     for env in ("hopper-medium-v2", "hopper-full-replay", "walker2d-medium-expert-v2"):
         script.Args(env=env)

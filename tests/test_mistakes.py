@@ -29,30 +29,22 @@ from conftest import (
 
 TASKS = (
     "(halfcheetah|hopper|walker2d)-"
-    "(random|medium|medium-replay|full-replay|medium-expert|expert)(-v2)?"
+    "(random|medium-replay|full-replay|medium-expert|medium|expert)(-v2)?"
 )
-COUNTS = "steps, frequencies, episodes and batch_size must be >= 1"
-RATES = "discount and tau must be between 0 and 1"
-NO_TASK = f"without --dataset, --env must be {TASKS}"
+NUMBERS = (
+    "eval_freq, eval_episodes, batch_size and policy_freq must be at least 1, discount "
+    "and tau from 0 to 1"
+)
 ARGUMENTS = [
-    (["--max-timesteps", 0], COUNTS),
-    (["--eval-freq", 0], COUNTS),
-    (["--eval-episodes", 0], COUNTS),
-    (["--batch-size", 0], COUNTS),
-    (["--policy-freq", -1], COUNTS),
-    (["--discount", 1.1], RATES),
-    (["--discount", -0.1], RATES),
-    (["--discount", "nan"], RATES),
-    (["--tau", 1.5], RATES),
-    (["--tau", -0.5], RATES),
-    (["--env", "hopper"], NO_TASK),
-    (["--env", "hopper-v2"], NO_TASK),
-    (["--env", "hopper-medium-v0"], NO_TASK),
-    (["--env", "walker2d-medum-v2"], NO_TASK),
-    (["--env", "hopper-medium-v2-v2"], NO_TASK),
-    (["--env", "hopper-"], NO_TASK),
-    (["--env", "ant-medium-v2"], NO_TASK),
-    (["--env", "HalfCheetah-v4"], NO_TASK),
+    (["--eval-freq", 0], NUMBERS),
+    (["--eval-episodes", 0], NUMBERS),
+    (["--batch-size", 0], NUMBERS),
+    (["--policy-freq", -1], NUMBERS),
+    (["--discount", 1.1], NUMBERS),
+    (["--discount", -0.1], NUMBERS),
+    (["--discount", "nan"], NUMBERS),
+    (["--tau", 1.5], NUMBERS),
+    (["--tau", -0.5], NUMBERS),
     (["--device", "cuda:77"], "no --device cuda:77 here; cpu works"),
     (["--device", "gpu"], "no --device gpu here; cpu works"),
 ]
@@ -60,12 +52,36 @@ ARGUMENTS = [
 
 @pytest.mark.parametrize("arguments, sentence", ARGUMENTS)
 def test_arguments(script, monkeypatch, capsys, arguments, sentence):
-    monkeypatch.setattr(script, "train", pytest.fail)  # so no server is asked, either
+    monkeypatch.setattr(script, "train", pytest.fail)
     monkeypatch.setattr("sys.argv", ["script.py", *map(str, arguments)])
     with pytest.raises(SystemExit) as stop:
         script.main()
     shown = re.sub(r"[^!-~]+", "", capsys.readouterr().err)  # the box and its breaks
     assert stop.value.code == 2 and sentence.replace(" ", "") in shown
+
+
+# Tasks
+
+NO_TASKS = [
+    "hopper",
+    "hopper-v2",
+    "hopper-medium-v0",
+    "walker2d-medum-v2",
+    "hopper-medium-v2-v2",
+    "hopper-",
+    "ant-medium-v2",
+    "HalfCheetah-v4",
+]
+
+
+@pytest.mark.parametrize("env", NO_TASKS)
+def test_tasks(script, monkeypatch, tmp_path, env):
+    """They are refused before a server is asked."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(script, "urlopen", pytest.fail)
+    shown = refusal(script, "python", "script.py", "--env", env, "--device", "cpu")
+    assert shown == f"without --dataset, --env must be {TASKS}"
+    assert not list(tmp_path.iterdir())
 
 
 # What doesn't fit or is not there, found before the first step
@@ -128,10 +144,10 @@ UNREADABLE = (
     "{path} can't be read: [...]; D4RL's format has arrays of observations, actions, "
     "rewards, terminals and timeouts (1 where an episode was cut off)"
 )
-SHAPE = "not ({}, {}) as the rewards and --env require; MATLAB reverses the axes"
+SHAPE = "not ({}, {}) as rewards and --env require; MATLAB reverses axes"
 WRONG = (
     "{path}: {key} is wrong in {count} row(s), first in row 7 ({value}): numbers must "
-    "be finite, terminals and timeouts 0 or 1, and actions from -1 to 1"
+    "be finite, terminals and timeouts 0 or 1, and actions within +-1.0"
 )
 NO_TRANSITIONS = "the dataset has 0 transitions: it needs rows with no timeout"
 DATASETS = [
@@ -141,7 +157,7 @@ DATASETS = [
     ],
     (
         lambda a: a.update({"actions/arm": a.pop("actions"), "actions/leg": 1}),
-        UNREADABLE.replace("[...]", "actions is a group of arm, leg"),
+        UNREADABLE.replace("[...]", "actions is a group of ['arm', 'leg']"),
     ),
     (
         lambda a: a.update({"rewards": 1.0}),
@@ -246,8 +262,8 @@ def test_a_download_that_fails(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(wpc, "D4RL_SERVERS", ["http://127.0.0.1:9/"])
     shown = refusal(wpc, "python", "wpc.py", "--env", "hopper-medium-v2")
     assert shown == (
-        f"{tmp_path}/hopper_medium-v2.hdf5 could not be downloaded: set "
-        "D4RL_DATASET_DIR to the folder that has it, or name a file with --dataset"
+        f"{tmp_path}/hopper_medium-v2.hdf5 is missing: give a --dataset, or set "
+        "D4RL_DATASET_DIR"
     )
     assert "Connection refused" in capsys.readouterr().out
 
@@ -261,7 +277,7 @@ RUNS = [
     ("wpc", ["--batch-size", 32], "batch_size"),
     ("td3_bc", [], "value_lr"),
     ("wbc", [], "alpha"),
-    ("wpc", ["--dataset", "other.hdf5"], "dataset"),
+    ("wpc", ["--dataset", "other.hdf5"], "dataset_sha256"),
 ]
 
 

@@ -386,7 +386,7 @@ def test_play_zoo_plays_the_policy_of_the_zip(tmp_path, capsys):
     actor = wpc.Actor(11, 3, 1.0)
     layers = ("latent_pi.0", 0), ("latent_pi.2", 2), ("mu", 4), ("log_std", 0)
     policy = {
-        f"actor.{name}.{x}": getattr(actor.net[i], x).detach()
+        f"actor.{name}.{x}": getattr(actor[i], x).detach()
         for name, i in layers
         for x in ("weight", "bias")
     }

@@ -36,10 +36,10 @@ RESULTS = (ROOT / "tests/results/README.md").read_text()
 TABLES = (ROOT / "tests/results/tables.md").read_text()
 MAP_ROW = re.compile(r"^\| (.*) \| \[\d+\]\(wpc\.py#L\d+\) \|$", re.M)
 MAP = {  # what the paper has, and how the line of wpc.py begins that does it
-    "networks, Table 4": "def mlp(input_dim, output_dim):",
+    "networks, Table 4": "class MLP(nn.Sequential):",
     "Algorithm 1: initialize": "self.critic = Critic(state_dim, action_dim)",
     "sample a batch": "batch = sample_batch(dataset, args.batch_size)",
-    "the target's action a'": "a_next = self.actor_target(s_next) + noise",
+    "the target's action a'": "a_next = (self.actor_target(s_next) + noise).clamp(",
     "the target y": "y = r + args.discount * (1 - done) * torch.min(q1_next, q2_next)",
     "Q1 and Q2 fit y": "critic_loss = F.mse_loss(q1, y) + F.mse_loss(q2, y)",
     "V fits y": "value_loss = F.mse_loss(v, y)",

@@ -610,7 +610,7 @@ MADE = {  # options of the dataset, --env, and the sentence or None where it goe
     "no limit at all": (
         {"env": gym.make("EndlessPendulum-v0")},
         None,
-        "time limit (has None)",
+        "and a time limit",
     ),
     "no limit": ({"env": made(max_episode_steps=-1)}, "Pendulum-v1", None),
     "not recorded": ({"env": None}, None, "records no environment: name it with --env"),

@@ -55,7 +55,7 @@ def test_scripts_stand_alone(name):
 
 # Size: what the user ordered is minimal. A line more has to take the place of another.
 
-LINES, NODES, FUNCTION, DIFF = 621, 4_331, 80, 49
+LINES, NODES, FUNCTION, DIFF = 560, 4_100, 70, 45
 
 
 def size(name):

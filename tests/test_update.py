@@ -36,9 +36,9 @@ def make_agent(script, **options):
         for target in (agent.actor_target, agent.critic_target):
             for parameter in target.parameters():
                 parameter += 0.05 * torch.randn_like(parameter)
-        agent.actor_target.net[4].weight *= 30
-        agent.critic.q1_net[4].bias -= 0.5
-        agent.critic.q2_net[4].bias -= 0.5
+        agent.actor_target[4].weight *= 30
+        agent.critic.q1[4].bias -= 0.5
+        agent.critic.q2[4].bias -= 0.5
     return agent
 
 
@@ -59,7 +59,7 @@ def center_value(agent, batch):
     """Moves V into the midst of Q, so that about half of the weights are 1."""
     s, a = batch["observations"], batch["actions"]
     with torch.no_grad():
-        agent.value.net[4].bias += (agent.critic.q1(s, a) - agent.value(s)).median()
+        agent.value[4].bias += (agent.critic.q1(s, a) - agent.value(s)).median()
 
 
 # The same step in NumPy, where a network is a list: weight, bias, weight, bias, ...
@@ -315,7 +315,7 @@ def test_td3_bc_without_the_q_term_is_behaviour_cloning():
     torch.manual_seed(1)
     args = td3_bc.Args(device="cpu")
     actor = td3_bc.Agent(STATE_DIM, ACTION_DIM, MAX_ACTION, args).actor
-    optimizer = td3_bc.adam(actor, 3e-4)
+    optimizer = td3_bc.Adam(actor.parameters(), 3e-4)
     dataset = {key: x.float() for key, x in make_batch().items()}
     torch.manual_seed(1)
     for step in range(1, 21):
@@ -340,7 +340,7 @@ def test_an_action_that_is_as_good_as_average_has_weight_zero(script):
 
 def test_exponential_weight_is_cut_off_at_100():
     agent = make_agent(OTHERS["exponential"], critic_lr=0.0, value_lr=0.0)
-    agent.value.net[4].bias.data -= 1e4
+    agent.value[4].bias.data -= 1e4
     assert agent.update(make_batch(), step=2)["weight"] == 100
 
 

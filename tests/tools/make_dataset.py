@@ -173,12 +173,12 @@ def learn(args, env, data):
     max_action = float(env.action_space.high[0])
     tensors = {key: torch.from_numpy(column) for key, column in data.items()}
 
-    actor = wpc.mlp(state_dim, 2 * action_dim)
+    actor = wpc.MLP(state_dim, 2 * action_dim)
     critic = wpc.Critic(state_dim, action_dim)
     critic_target = copy.deepcopy(critic)
     log_alpha = torch.zeros(1, requires_grad=True)
-    actor_optimizer = wpc.adam(actor, LEARNING_RATE)
-    critic_optimizer = wpc.adam(critic, LEARNING_RATE)
+    actor_optimizer = wpc.Adam(actor.parameters(), LEARNING_RATE)
+    critic_optimizer = wpc.Adam(critic.parameters(), LEARNING_RATE)
     alpha_optimizer = torch.optim.Adam([log_alpha], LEARNING_RATE)
 
     state, _ = env.reset(seed=args.seed)

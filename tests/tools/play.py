@@ -55,7 +55,7 @@ def load(run_dir):
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         weights = checkpoint["agent"]["actor"]
-        dims = weights["net.0.weight"].shape[1], len(weights["net.4.weight"])
+        dims = weights["0.weight"].shape[1], len(weights["4.weight"])
         actor = wpc.Actor(*dims, checkpoint["max_action"])
         actor.load_state_dict(weights)
     except Exception as error:  # of as many types as there are kinds of damage

@@ -40,8 +40,8 @@ def read_actor(path):
     policy = torch.load(policy, map_location="cpu", weights_only=True)
     tensors = [policy[f"{layer}.{x}"] for layer in LAYERS for x in ("weight", "bias")]
     actor = wpc.Actor(tensors[0].shape[1], len(tensors[-1]), max_action=1.0)
-    names = actor.net.state_dict().keys()
-    actor.net.load_state_dict(dict(zip(names, tensors, strict=True)))
+    names = actor.state_dict().keys()
+    actor.load_state_dict(dict(zip(names, tensors, strict=True)))
     return actor
 
 

@@ -63,7 +63,7 @@ class Options:
 
 
 class Networks(nn.Module):
-    """R networks of the script's `mlp` as one, with parameters (R, P)."""
+    """R of the script's `MLP` as one, with parameters (R, P)."""
 
     def __init__(self, networks):
         super().__init__()
@@ -88,13 +88,24 @@ class Networks(nn.Module):
         vector_to_parameters(self.flat.detach()[i], network.parameters())
 
 
+class Actors(nn.Module):
+    """The policies of R runs."""
+
+    def __init__(self, actors):
+        super().__init__()
+        self.net, self.max_action = Networks(actors), actors[0].max_action
+
+    def forward(self, s):
+        return self.max_action * torch.tanh(self.net(s))
+
+
 class Critics(nn.Module):
     """The twin critics of R runs, as 2 R networks."""
 
     def __init__(self, critics):
         super().__init__()
-        networks = [critic.q1_net for critic in critics]
-        self.net = Networks(networks + [critic.q2_net for critic in critics])
+        q2s = [critic.q2 for critic in critics]
+        self.net = Networks([critic.q1 for critic in critics] + q2s)
 
     def forward(self, s, a):
         sa = torch.cat([s, a], dim=-1)
@@ -109,7 +120,7 @@ class Values(nn.Module):
 
     def __init__(self, values, scripts):
         super().__init__()
-        self.net = Networks([value.net for value in values])
+        self.net = Networks(values)
         weight_1 = torch.tensor([[[script == "td3_bc"]] for script in scripts])
         self.register_buffer("weight_1", weight_1)
 
@@ -171,8 +182,7 @@ class Runs:
         agent.args = wpc.Args(**{k: x for k, x in shared.items() if k in known})
         alphas = [[[getattr(args, "alpha", 0.0)]] for args in runs]
         agent.args.alpha = torch.tensor(alphas, device=device)
-        agent.actor = copy.deepcopy(agents[0].actor)
-        agent.actor.net = Networks([x.actor.net for x in agents])
+        agent.actor = Actors([x.actor for x in agents])
         agent.critic = Critics([x.critic for x in agents])
         agent.value = Values([x.value for x in agents], map(script_of, runs))
         for name in NETWORKS:
@@ -253,17 +263,11 @@ class Runs:
         metrics = {name: x.flatten().tolist() for name, x in self.metrics.items()}
         networks = copy.deepcopy(self.agent.actor.net).cpu()
         for i, args in enumerate(self.runs):
-            networks.copy_to(i, self.actor.net)
+            networks.copy_to(i, self.actor)
             actor = copy.deepcopy(self.actor)
             _, mean, std, best_return = self.data[i]
-            data = [mean.tolist(), std.tolist(), best_return]
-            identity = asdict(args) | {"dataset": data}
-            identity["made_by"] = "together.py"  # so that no script goes on
-            for name in ("max_timesteps", "device", "run_dir"):
-                del identity[name]
             checkpoint = {
                 "args": asdict(args),
-                "identity": identity,
                 "agent": {"actor": actor.state_dict()},
                 "mean": mean,
                 "std": std,
@@ -319,7 +323,7 @@ class Evaluations:
                 future, checkpoint, row = job
                 rows.append({"step": step} | future.result() | row)
                 checkpoint["evaluations"] = rows
-                checkpoint["args"] |= self.made_by
+                checkpoint["args"] |= self.made_by  # with which no script goes on
                 wpc.save(Path(args.run_dir), checkpoint)
             del self.pending[0]
 

@@ -38,8 +38,9 @@ LINES = {
 """,
 }
 BETTER_HALF = """\
-    episode = np.cumsum(ends) - ends  # the number of each row's episode
-    returns = np.bincount(episode, rewards)
+    end = (terminals + timeouts).ravel() > 0
+    episode = np.cumsum(end) - end  # the number of each row's episode
+    returns = np.bincount(episode, arrays["rewards"].ravel())
     better_half = np.float32(returns >= np.median(returns))[episode, None]
     arrays = arrays | {"better_half": better_half}
 """
