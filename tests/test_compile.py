@@ -35,7 +35,6 @@ from conftest import (
 )
 from torch._inductor.decomposition import decompositions
 from torch._inductor.exc import InductorError
-from torch.utils.flop_counter import FlopCounterMode
 
 sys.path.insert(0, str(ROOT / "tests/tools"))
 compiled = importlib.import_module("compiled")
@@ -378,8 +377,6 @@ def test_the_benchmark_runs_the_scripts(script):
 
 def test_the_benchmark_compiles_what_it_calls_compiled(monkeypatch):
     updates = []
-    for name in ("textbook_steps", "product_steps"):
-        monkeypatch.setattr(benchmark, name, lambda: None)
     monkeypatch.setattr(
         benchmark,
         "two_steps_a_call",
@@ -392,49 +389,6 @@ def test_the_benchmark_compiles_what_it_calls_compiled(monkeypatch):
         assert updates == [script.Agent.update]
         made[f"{script.__name__}.py"].step(1)
         assert updates.pop() and not updates
-
-
-def test_the_textbook_loop_is_wpc(monkeypatch):
-    """With the same networks and batch, four steps lead to the same parameters."""
-    batch, made = random_batch(), []
-    names = ["observations", "actions", "next_observations", "rewards"]
-    columns = [*(batch[name] for name in names), 1 - batch["terminals"]]
-    buffer = types.SimpleNamespace(sample=lambda _: columns)
-    monkeypatch.setattr(benchmark, "Buffer", lambda: buffer)
-    agent = wpc.Agent(5, 2, 1.0, wpc.Args(device="cpu"))
-
-    def copies(network):
-        def make(*_):
-            made.append(copy.deepcopy(network))
-            return made[-1]
-
-        return make
-
-    for name in ("Actor", "Critic", "Value"):
-        monkeypatch.setattr(wpc, name, copies(getattr(agent, name.lower())))
-    step = benchmark.textbook_steps()
-    for i in range(1, 5):
-        torch.manual_seed(i)
-        step(i)
-        torch.manual_seed(i)
-        agent.update(batch, i)
-    names = ("actor", "actor_target", "critic", "critic_target", "value")
-    for name, network in zip(names, made, strict=True):
-        expected = getattr(agent, name).state_dict()
-        torch.testing.assert_close(network.state_dict(), expected, rtol=1e-3, atol=1e-6)
-
-
-def test_the_bare_products_are_those_of_wpc():
-    def products(step, i):
-        with FlopCounterMode(display=False) as counter:
-            step(i)
-        return counter.get_total_flops()
-
-    bare, ours = benchmark.product_steps(), benchmark.script_steps(wpc)
-    assert products(bare, 1) == products(ours, 1)
-    # The gradient of Q1's parameters of the policy's loss, which nothing needs
-    unused = 2 * 256 * (14 * 256 + 256 * 256 + 256)
-    assert products(bare, 2) == products(ours, 2) - unused
 
 
 def test_a_peer_is_measured_on_the_cpu(tmp_path):
@@ -450,40 +404,13 @@ def test_a_peer_is_measured_on_the_cpu(tmp_path):
     assert benchmark.Steps(benchmark.peer_steps(tmp_path / "peer.py")).run(2) > 0
 
 
-OLDER = {
-    "two_steps_a_call": """
-TraceableAdam = None
-def two_steps_a_call(agent, update, sample_batch):
-    return lambda dataset, step: update(agent, sample_batch(dataset, 256), step)
-""",
-    "compile_update": """
-TraceableAdam = None
-def compile_update(agent, update):
-    return lambda batch, step: update(agent, batch, step)
-""",
-}
-
-
-@pytest.mark.parametrize("text", OLDER.values(), ids=OLDER)
-def test_an_older_tool_is_measured(monkeypatch, tmp_path, text):
-    folder = tmp_path / "tests/tools"
-    folder.mkdir(parents=True)
-    (folder / "compiled.py").write_text(text)
-    for name in ("textbook_steps", "product_steps"):
-        monkeypatch.setattr(benchmark, name, lambda: None)
-    monkeypatch.setattr(benchmark, "d3rlpy", None)
-    made = benchmark.variants(benchmark.Args(older=tmp_path), threads=1)
-    for script in SCRIPTS.values():
-        assert made[f"compiled {script.__name__}.py, older"].run(2) > 0
-
-
 def test_d3rlpy_is_measured():
     pytest.importorskip("d3rlpy")
     assert benchmark.Steps(benchmark.d3rlpy_steps()).run(2) > 0
 
 
 def test_the_benchmarks_table(monkeypatch, capsys):
-    speeds = {"textbook": 100.0, "products": 250.0}
+    speeds = {"wpc.py": 100.0, "compiled wpc.py": 250.0}
     made = {}
     for name, x in speeds.items():  # the first turn compiles; then three count
         turns = iter([1.0, x, 9 * x, x])
@@ -494,7 +421,7 @@ def test_the_benchmarks_table(monkeypatch, capsys):
     monkeypatch.setattr(torch, "set_num_threads", lambda _: None)
     benchmark.main(benchmark.Args(rounds=3))
     lines = capsys.readouterr().out.splitlines()
-    assert lines[2:] == ["| textbook | 1.00 | 100 |", "| products | 2.50 | 250 |"]
+    assert lines[2:] == ["| wpc.py | 1.00 | 100 |", "| compiled wpc.py | 2.50 | 250 |"]
 
 
 def test_speed_is_steps_a_second(monkeypatch):

@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Training speed of the scripts, plain and compiled, beside a textbook loop, the bare
-matrix products of a step, and other people's files.
+"""Training speed of the scripts, plain and compiled, beside other people's files.
 
     python tests/tools/benchmark.py
     python tests/tools/benchmark.py --peers TD3_BC/TD3_BC.py wPC/TD3_wBC.py \\
-        --jax JAX-CORL/algos/td3bc.py --older OLD_CHECKOUT
+        --jax JAX-CORL/algos/td3bc.py
 
 The second line also measures files of github.com/sfujim/TD3_BC, github.com/qsa-fox/wPC
-and github.com/nissymori/JAX-CORL, which you download yourself, and compiled.py of an
-older checkout; JAX-CORL needs jax, flax, optax, omegaconf and pydantic. d3rlpy's
-TD3PlusBC is measured where d3rlpy is installed. All variants take turns, so that other
-load slows all of them alike. The table has ratios of medians, and the medians.
+and github.com/nissymori/JAX-CORL, which you download yourself; JAX-CORL needs jax,
+flax, optax, omegaconf and pydantic. d3rlpy's TD3PlusBC is measured where d3rlpy is
+installed. All variants take turns, so that other load slows all of them alike. The
+table has medians, and their ratios to wpc.py's.
 """
 
 import os
@@ -22,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 import tyro
 from check_steps import load
 from compiled import two_steps_a_call
@@ -52,25 +50,10 @@ class Args:
     """other files to measure, with a class TD3_BC as TD3_BC.py has it"""
     jax: Path | None = None
     """JAX-CORL's td3bc.py"""
-    older: Path | None = None
-    """an older checkout, whose compiled.py is measured with the scripts of this one"""
 
 
 def plain(agent, update, sample_batch):
     return lambda dataset, step: update(agent, sample_batch(dataset, BATCH), step)
-
-
-def compiled_by(checkout):
-    """How an older checkout's compiled.py makes an agent's steps."""
-    tool = load(checkout / "tests/tools/compiled.py", "TraceableAdam")
-    if hasattr(tool, "two_steps_a_call"):
-        return tool.two_steps_a_call
-
-    def make_steps(agent, update, sample_batch):
-        compiled = tool.compile_update(agent, update)
-        return lambda dataset, step: compiled(sample_batch(dataset, BATCH), step)
-
-    return make_steps
 
 
 def script_steps(script, make_steps=plain):
@@ -184,88 +167,6 @@ class JaxSteps:
         return int(done) / float(seconds)
 
 
-def textbook_steps():
-    """wPC as one would first write it: a buffer of NumPy arrays, three plain Adams, a
-    loop for the targets."""
-    actor, actor_target = (wpc.Actor(STATE_DIM, ACTION_DIM, 1.0) for _ in range(2))
-    critic, critic_target = (wpc.Critic(STATE_DIM, ACTION_DIM) for _ in range(2))
-    value = wpc.Value(STATE_DIM)
-    actor_optimizer = torch.optim.Adam(actor.parameters(), 3e-4)
-    critic_optimizer = torch.optim.Adam(critic.parameters(), 3e-4)
-    value_optimizer = torch.optim.Adam(value.parameters(), 3e-4)
-    buffer = Buffer()
-
-    def step(i):
-        s, a, s_next, r, not_done = buffer.sample(BATCH)
-        with torch.no_grad():
-            noise = (torch.randn_like(a) * 0.2).clamp(-0.5, 0.5)
-            a_next = (actor_target(s_next) + noise).clamp(-1, 1)
-            y = r + 0.99 * not_done * torch.min(*critic_target(s_next, a_next))
-        q1, q2 = critic(s, a)
-        critic_loss = F.mse_loss(q1, y) + F.mse_loss(q2, y)
-        critic_optimizer.zero_grad()
-        critic_loss.backward()
-        critic_optimizer.step()
-        value_loss = F.mse_loss(value(s), y)
-        value_optimizer.zero_grad()
-        value_loss.backward()
-        value_optimizer.step()
-        if i % 2 == 0:
-            with torch.no_grad():
-                weight = (critic.q1(s, a) > value(s)).float()
-            pi = actor(s)
-            q = critic.q1(s, pi)
-            constraint = (weight * (pi - a) ** 2).mean()
-            actor_loss = -2.5 / q.abs().mean().detach() * q.mean() + constraint
-            actor_optimizer.zero_grad()
-            actor_loss.backward()
-            actor_optimizer.step()
-            for network, target in ((critic, critic_target), (actor, actor_target)):
-                pairs = zip(network.parameters(), target.parameters(), strict=True)
-                for p, p_target in pairs:
-                    p_target.data.copy_(0.005 * p.data + 0.995 * p_target.data)
-
-    return step
-
-
-def product_steps():
-    """The floor: only wPC's matrix products, forward and backward, at their shapes."""
-
-    def network(inputs, outputs):
-        sizes = ((inputs, 256), (256, 256), (256, outputs))
-        return [
-            (torch.randn(BATCH, i), torch.randn(o, i), torch.randn(BATCH, o))
-            for i, o in sizes
-        ]
-
-    v, q = network(STATE_DIM, 1), network(STATE_DIM + ACTION_DIM, 1)
-    pi = network(STATE_DIM, ACTION_DIM)
-
-    def forward(network):
-        for x, weight, _ in network:
-            x @ weight.T
-
-    def backward(network, parameters=True, inputs=False):
-        for i, (x, weight, gradient) in enumerate(network):
-            if parameters:
-                gradient.T @ x
-            if i > 0 or inputs:
-                gradient @ weight
-
-    def step(i):
-        for network in (pi, q, q, q, q, v):  # targets: pi and both Q; then both Q and V
-            forward(network)
-        for network in (q, q, v):
-            backward(network)
-        if i % 2 == 0:
-            for network in (q, v, pi, q):  # the weight; then Q1(s, pi(s))
-                forward(network)
-            backward(q, parameters=False, inputs=True)
-            backward(pi)
-
-    return step
-
-
 class Steps:
     """Training steps in this process."""
 
@@ -281,14 +182,11 @@ class Steps:
 
 
 def variants(args, threads):
-    made = {"textbook": Steps(textbook_steps()), "products": Steps(product_steps())}
+    made = {}
     for script in (wpc, td3_bc, wbc):
         name = script.SCRIPT.name
         made[name] = Steps(script_steps(script))
         made[f"compiled {name}"] = Steps(script_steps(script, two_steps_a_call))
-        if args.older:
-            steps = script_steps(script, compiled_by(args.older))
-            made[f"compiled {name}, older"] = Steps(steps)
     made |= {path.name: Steps(peer_steps(path)) for path in args.peers}
     if d3rlpy:
         made["d3rlpy's TD3PlusBC"] = Steps(d3rlpy_steps())
@@ -319,12 +217,12 @@ def main(args: Args):
         os.sched_setaffinity(0, all_cores)
     header = "| "
     for threads in columns:
-        header += f"| {threads} thread(s): / textbook | steps/s "
+        header += f"| {threads} thread(s): / wpc.py | steps/s "
     print(f"{header}|\n|---|" + "---|---|" * len(columns))
     for name in columns[1]:
         row = f"| {name} "
         for speed in columns.values():
-            row += f"| {speed[name] / speed['textbook']:.2f} | {speed[name]:.0f} "
+            row += f"| {speed[name] / speed['wpc.py']:.2f} | {speed[name]:.0f} "
         print(f"{row}|")
 
 
