@@ -38,7 +38,7 @@ import torch.nn.functional as F
 import tyro
 from torch.utils.tensorboard import SummaryWriter
 
-os.environ.pop("MUJOCO_GL", None)  # if its library is missing, mujoco won't import
+os.environ.pop("MUJOCO_GL", None)  # names a drawing library, which may be missing
 import mujoco
 
 SCRIPT = Path(globals().get("__file__", os.devnull))  # in a notebook: an empty file
@@ -310,10 +310,10 @@ def make_envs(env, num_envs):
 @torch.no_grad()
 def evaluate(envs, actor, mean, std, args):
     """Plays an episode in each of `envs`; returns mean, deviation and D4RL's score."""
-    # Every evaluation has the same start states: environment i is seeded with this + i.
-    observations, _ = envs.reset(seed=1000 * (args.seed + 100))  # 100 is TD3+BC's
+    # Start states are the same each time: environment i is seeded with this + i.
+    observations, _ = envs.reset(seed=1000 * (args.seed + 100))  # 100 as in TD3+BC
     returns = np.zeros(envs.num_envs)
-    running = returns == 0
+    running = returns == 0  # all of them
     while running.any():
         states = torch.as_tensor(observations).to(mean)  # as float32, on its device
         actions = actor((states - mean) / std).cpu().numpy()
@@ -405,7 +405,7 @@ def prepare_dataset(arrays, args):
     """
     arrays = {"next_observations": np.roll(arrays["observations"], -1, 0)} | arrays
     terminals, timeouts = arrays["terminals"], arrays.pop("timeouts")
-    keep = np.flatnonzero((terminals >= timeouts)[:-1])
+    keep = np.flatnonzero((terminals >= timeouts)[:-1])  # not timeouts alone
     if not keep.size:
         raise UserError("the dataset has 0 transitions: it needs rows with no timeout")
     best_return, return_to_go = -np.inf, 0.0
@@ -469,7 +469,7 @@ def resume(path, agent, args):
         saved = checkpoint["args"]
     except Exception as error:  # of many types where a file is damaged
         raise UserError(f"{path} can't be read: choose another --run-dir") from error
-    may_change = "dataset", "max_timesteps", "device", "run_dir"  # paths, not contents
+    may_change = "dataset", "max_timesteps", "device", "run_dir"  # but not the data
     for name in saved | args:
         if name not in may_change and args.get(name) != saved.get(name):
             raise UserError(f"{path} has another {name}: choose another --run-dir")
@@ -504,23 +504,23 @@ def train(args):
     torch.manual_seed(args.seed)
 
     path = Path(args.run_dir, "checkpoint.pt")
-    first_step, rows = 0, []
+    start, rows = 0, []
     if path.exists():
         rows = resume(path, agent, settings)
-        first_step = rows[-1]["step"] + 1
-    if first_step > args.max_timesteps:
+        start = rows[-1]["step"] + 1
+    if start > args.max_timesteps:
         print(f"{args.run_dir} is finished; raise --max-timesteps to train longer")
 
-    writer = SummaryWriter(args.run_dir, purge_step=first_step)
+    writer = SummaryWriter(args.run_dir, purge_step=start)
     metrics = {}
     clock = perf_counter()
-    for step in range(first_step, args.max_timesteps + 1):
+    for step in range(start, args.max_timesteps + 1):
         if step:  # at step 0 only evaluate, to find a broken environment early
             batch = sample_batch(dataset, args.batch_size)
             metrics |= agent.update(batch, step)  # lmbda etc. keep their last value
         if step % args.eval_freq == 0 or step == args.max_timesteps:
             scalars = {k: x.item() for k, x in metrics.items()}  # waits for the GPU
-            speed = (step - first_step) / (perf_counter() - clock)
+            speed = (step - start) / (perf_counter() - clock)
             row = {"step": step} | evaluate(envs, agent.actor, mean, std, args)
             row |= scalars | {"steps_per_second": speed}
             row["best_discounted_return"] = best_return
@@ -540,7 +540,7 @@ def train(args):
             shown = {"mean_return", "normalized_score", "best_discounted_return", "q"}
             line = ", ".join(f"{k} {x:.1f}" for k, x in row.items() if k in shown)
             print(f"step {step:,}: {line}", flush=True)
-            clock, first_step = perf_counter(), step
+            clock, start = perf_counter(), step  # of the steps to the next row
     writer.close()
     return rows
 
