@@ -257,7 +257,7 @@ D4RL_TASK = re.compile(
 
 
 def d4rl_robot(env):  # for hopper or hopper-medium-v2; None for Hopper-v4
-    return D4RL_ROBOTS.get(D4RL_TASK.sub(r"\1", env))
+    return D4RL_ROBOTS.get(D4RL_TASK.sub(r"\1", env))  # a task becomes its robot
 
 
 def use_d4rl_physics(env):
@@ -465,7 +465,7 @@ def save(run_dir, checkpoint):
 def resume(path, agent, args):
     """Loads a checkpoint of the same `args`, or raises UserError; returns its rows."""
     try:
-        checkpoint = torch.load(path, map_location="cpu")
+        checkpoint = torch.load(path, "cpu")
         saved = checkpoint["args"]
     except Exception as error:  # of many types where a file is damaged
         raise UserError(f"{path} can't be read: choose another --run-dir") from error
@@ -526,7 +526,7 @@ def train(args):
             row["best_discounted_return"] = best_return
             if not np.isfinite(sum(row.values())):
                 raise UserError(f"diverged by step {step}, which isn't saved: {row}")
-            if path.exists() and torch.load(path)["evaluations"] != rows:
+            if path.exists() and torch.load(path, "cpu")["evaluations"] != rows:
                 raise UserError(f"{args.run_dir} is used by another process too")
             rows.append(row)
             state = {k: x.state_dict() for k, x in vars(agent).items() if k != "args"}
