@@ -370,9 +370,9 @@ def prepare_dataset(arrays, args):
     """The transitions in `read_dataset`'s columns, {name: float32 tensor (N, width)}.
 
     Row i gives (o[i], a[i], r[i], o[i + 1], terminal[i]), or the file's own next state.
-    The last row and rows with a timeout are left out, as in d4rl, but rows that are
-    terminal, too, stay. Also returns the mean and std, (state_dim,), by which states
-    are normalized, and the best discounted return from any row to its episode's end.
+    The last row is left out, and rows with a timeout, unless they are terminal, too
+    (d4rl drops these). Also returns the mean and std, (state_dim,), by which states are
+    normalized, and the best discounted return from any row to its episode's end.
     """
     arrays = {"next_observations": np.roll(arrays["observations"], -1, 0)} | arrays
     terminals, timeouts = arrays["terminals"], arrays.pop("timeouts")
@@ -433,20 +433,20 @@ def save(run_dir, checkpoint):
     write_file(run_dir / "args.json", args.encode())
 
 
-def resume(path, agent, args):
-    """Loads a checkpoint of the same `args`, or raises UserError; returns its rows."""
+def resume(path, agent, settings):
+    """Loads a checkpoint of these `settings`, or raises UserError; returns its rows."""
     try:
         checkpoint = torch.load(path, "cpu")
         saved = checkpoint["args"]
     except Exception as error:  # of many types where a file is damaged
         raise UserError(f"{path} can't be read: choose another --run-dir") from error
     may_change = "dataset", "max_timesteps", "device", "run_dir"  # but not the data
-    for name in saved | args:
-        if name not in may_change and args.get(name) != saved.get(name):
+    for name in saved | settings:
+        if name not in may_change and settings.get(name) != saved.get(name):
             raise UserError(f"{path} has another {name}: choose another --run-dir")
     for name, state in checkpoint["agent"].items():
         getattr(agent, name).load_state_dict(state)
-    torch.manual_seed(args["seed"] + checkpoint["step"])  # GPU: draws new numbers
+    torch.manual_seed(settings["seed"] + checkpoint["step"])  # GPU: draws new numbers
     torch.set_rng_state(checkpoint["rng_state"])  # CPU: exactly where it was
     return checkpoint["evaluations"]
 
