@@ -466,7 +466,7 @@ def train(args):
     print(
         f"{file} has {len(dataset['rewards']):,} transitions, "
         f"{dataset['terminals'].sum():,.0f} of them terminal; the largest action is "
-        f"{dataset['actions'].abs().max():.4g} of {max_action}; alpha is {args.alpha}"
+        f"{dataset['actions'].abs().max():.4g} (bound {max_action}); alpha {args.alpha}"
     )
 
     torch.manual_seed(args.seed)

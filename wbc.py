@@ -484,7 +484,7 @@ def train(args):
     print(
         f"{file} has {len(dataset['rewards']):,} transitions, "
         f"{dataset['terminals'].sum():,.0f} of them terminal; the largest action is "
-        f"{dataset['actions'].abs().max():.4g} of {max_action}"
+        f"{dataset['actions'].abs().max():.4g} (bound {max_action})"
     )
 
     torch.manual_seed(args.seed)

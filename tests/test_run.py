@@ -66,8 +66,8 @@ def test_a_run_from_start_to_end(monkeypatch, capfd, tmp_path, name):
     assert len(lines) == 5 and lines[0].startswith(
         "to continue, add --run-dir 'runs/half"
     )
-    assert "89,910 transitions, 0 of them terminal; the largest action is 1" in lines[1]
-    assert name == "wbc" or lines[1].endswith("alpha is 2.5")
+    assert "89,910 transitions, 0 of them terminal; the largest action is 1 (bound 1.0)" in lines[1]
+    assert name == "wbc" or lines[1].endswith("; alpha 2.5")
     (run_dir,) = Path("runs").iterdir()
     assert run_dir.name.startswith(f"halfcheetah_replay__{name}__0__20")
 
