@@ -461,7 +461,7 @@ def train(args):
     max_action = float(envs.single_action_space.high[0])
     arrays = read_dataset(file, state_dim, action_dim, max_action)
     digest = sha256(b"".join(arrays.values())).hexdigest()
-    settings = vars(args) | {"dataset_sha256": digest}
+    settings = vars(args) | {"dataset_contents": digest}
     dataset, mean, std, best_return = prepare_dataset(arrays, args)
     print(
         f"{file} has {len(dataset['rewards']):,} transitions, "

@@ -277,7 +277,7 @@ RUNS = [
     ("wpc", ["--batch-size", 32], "batch_size"),
     ("td3_bc", [], "value_lr"),
     ("wbc", [], "alpha"),
-    ("wpc", ["--dataset", "other.hdf5"], "dataset_sha256"),
+    ("wpc", ["--dataset", "other.hdf5"], "dataset_contents"),
 ]
 
 

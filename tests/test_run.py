@@ -66,7 +66,8 @@ def test_a_run_from_start_to_end(monkeypatch, capfd, tmp_path, name):
     assert len(lines) == 5 and lines[0].startswith(
         "to continue, add --run-dir 'runs/half"
     )
-    assert "89,910 transitions, 0 of them terminal; the largest action is 1 (bound 1.0)" in lines[1]
+    assert "89,910 transitions, 0 of them terminal; the largest action" in lines[1]
+    assert " is 1 (bound 1.0)" in lines[1]
     assert name == "wbc" or lines[1].endswith("; alpha 2.5")
     (run_dir,) = Path("runs").iterdir()
     assert run_dir.name.startswith(f"halfcheetah_replay__{name}__0__20")
@@ -95,7 +96,7 @@ def test_a_run_from_start_to_end(monkeypatch, capfd, tmp_path, name):
     checkpoint = load(run_dir)  # the policy in it plays the last row again
     actor = script.Actor(17, 6, checkpoint["max_action"])
     actor.load_state_dict(checkpoint["agent"]["actor"])
-    assert checkpoint["args"].pop("dataset_sha256")
+    assert checkpoint["args"].pop("dataset_contents")
     args = script.Args(**checkpoint["args"])
     envs = script.make_envs(args.env, args.eval_episodes)
     row = script.evaluate(envs, actor, checkpoint["mean"], checkpoint["std"], args)
@@ -148,7 +149,7 @@ def test_args_json_says_what_the_run_is_of(finished):
             np.float32(file[name][:]).tobytes()
             for name in ("observations", "actions", "rewards", "terminals", "timeouts")
         )
-    assert record.pop("dataset_sha256") == hashlib.sha256(data).hexdigest()
+    assert record.pop("dataset_contents") == hashlib.sha256(data).hexdigest()
     args = wpc.Args(**record)  # nothing else is in it
     assert (args.env, args.dataset) == ("halfcheetah", str(DATASET))
     assert (args.max_timesteps, args.eval_freq, args.alpha) == (60, 30, 2.5)
@@ -391,7 +392,7 @@ def test_a_run_does_not_go_on_with_other_data(run_dir, tmp_path, change):
     path, before = tmp_path / "other.hdf5", files(run_dir)
     write_hdf5(path, other_data(change))
     line = command("wpc", "--run-dir", run_dir, "--dataset", path)
-    assert "has another dataset_sha256: choose" in refusal(wpc, *line)
+    assert "has another dataset_contents: choose" in refusal(wpc, *line)
     assert files(run_dir) == before
 
 
@@ -421,11 +422,20 @@ def test_a_sweep_outlives_its_trials(tmp_path, monkeypatch):
     assert opened[1] == opened[2] and len(list(Path("runs").iterdir())) == 3
 
 
-def test_a_run_of_a_gpu_goes_on_without_one(run_dir):
+def test_a_run_of_a_gpu_goes_on_without_one(run_dir, monkeypatch):
     checkpoint = load(run_dir)
     checkpoint["args"]["device"] = "cuda"
     torch.save(checkpoint, run_dir / "checkpoint.pt")
+    places, real_load = [], torch.load
+
+    def torch_load(path, map_location=None):
+        places.append(map_location)
+        return real_load(path, map_location)
+
+    monkeypatch.setattr(torch, "load", torch_load)
     run_here(wpc, *command("wpc", "--run-dir", run_dir, "--max-timesteps", 61))
+    assert places == ["cpu", "cpu"]  # to continue, and to see who saved last
+    monkeypatch.undo()
     assert load(run_dir)["step"] == 61
 
 

@@ -423,6 +423,9 @@ def test_environments_that_the_scripts_can_not_use(tmp_path):
     args = make_dataset.Args("CartPole-v1", 10, tmp_path / "made.hdf5")
     sentence = refusal_of(make_dataset.main, args)
     assert "one-dimensional Boxes of states" in sentence
+    line = [sys.executable, ROOT / "tests/tools/make_dataset.py", "--random"]
+    line += ["--steps", 2, "--out", tmp_path / "made.hdf5", "--env", "nope-v0"]
+    assert_one_sentence(run(*line), "Environment `nope` doesn't exist")
 
 
 def test_out_is_tried_before_the_work(tmp_path, monkeypatch):

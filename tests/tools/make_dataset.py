@@ -28,6 +28,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import gymnasium as gym
 import h5py
 import numpy as np
 import torch
@@ -335,5 +336,5 @@ def main(args):
 if __name__ == "__main__":
     try:
         main(tyro.cli(Args, description=__doc__))
-    except wpc.UserError as error:
+    except (wpc.UserError, ImportError, gym.error.Error) as error:
         sys.exit(str(error))
