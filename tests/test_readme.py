@@ -650,11 +650,12 @@ def test_what_it_says_against_itself_is_in_the_runs():
     assert len(missing) == 6 and "Missing are BC on six tasks, and the other" in RESULTS
 
 
-def test_the_other_tasks_have_one_seed_each():
+def test_the_other_tasks_have_one_or_two_seeds():
     for task in experiments.TASKS:
-        counts = {len(tables(script, task)) for script in ("wpc", "td3_bc")}
-        assert (counts == {1}) == (task[-7:] != "-medium")
-    assert "The other nine tasks have one seed each, on data of [our own]" in README
+        if task[-7:] != "-medium":
+            for script in ("wpc", "td3_bc", "wbc"):
+                assert len(tables(script, task)) in (1, 2)
+    assert "The other nine tasks have one or two seeds, on data of [our own]" in README
     ends = {}
     for task in experiments.TASKS[-3:]:
         ends[task] = [float(end_of(script, task)[0]) for script in ("wpc", "td3_bc")]
