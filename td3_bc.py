@@ -190,8 +190,8 @@ class Agent:
             # Policy: maximise Q under the constraint
             pi = self.actor(s)
             q_pi = self.critic.q1(s, pi)
-            # The paper divides by mean Q, which would minimise Q where it is negative;
-            # its authors' code divides by mean |Q|, as is done here.
+            # The paper divides by mean Q, which would minimise Q where it is negative.
+            # Its authors' code has mean |Q|, and averages over action dimensions, too.
             lmbda = args.alpha / q_pi.abs().mean().detach()
             constraint = ((pi - a) ** 2).mean()
             actor_loss = -lmbda * q_pi.mean() + constraint  # eq. 4, to be minimised
@@ -281,7 +281,7 @@ def make_envs(env, num_envs):
 @torch.no_grad()
 def evaluate(envs, actor, mean, std, args):
     """Plays an episode in each of `envs`; returns mean, deviation and D4RL's score."""
-    # Start states are the same each time: environment i is seeded with this + i.
+    # Always the same start states: environment i gets this + i. Runs lie 1000 apart.
     observations, _ = envs.reset(seed=1000 * (args.seed + 100))  # 100 as in TD3+BC
     returns = np.zeros(envs.num_envs)
     running = returns == 0  # all of them

@@ -299,7 +299,7 @@ def make_envs(env, num_envs):
 @torch.no_grad()
 def evaluate(envs, actor, mean, std, args):
     """Plays an episode in each of `envs`; returns mean, deviation and D4RL's score."""
-    # Start states are the same each time: environment i is seeded with this + i.
+    # Always the same start states: environment i gets this + i. Runs lie 1000 apart.
     observations, _ = envs.reset(seed=1000 * (args.seed + 100))  # 100 as in TD3+BC
     returns = np.zeros(envs.num_envs)
     running = returns == 0  # all of them

@@ -743,6 +743,10 @@ def test_its_hours_are_those_of_the_measured_speeds():
     )
     assert f"\n| `td3_bc.py`, one core | {td3_bc} | {compiled} |\n" in README
     assert f"\n| d3rlpy's TD3+BC, one core | {d3rlpy} | |\n" in README
+    assert round(1e6 / speeds["wpc.py"][0] / 3600) == 3
+    (hopper,) = (x for x in rows_of(TABLES, "Table 1") if x[0] == "hopper-medium")
+    score = f"an idle core, and should score about {float(hopper[2].split()[0]):.0f}."
+    assert f"`wpc.py` takes [almost three hours](#speed) on {score}" in README
     jax = speeds["JAX-CORL, no LayerNorm"][0]
     cells = f"no LayerNorm, one core | {jax}/s, {1e6 / jax / 3600:.1f} hours | |\n"
     assert f"\n| JAX-CORL's TD3+BC, {cells}" in README

@@ -380,7 +380,7 @@ def other_data(change):
 
 OTHER_DATA = {
     "other units": lambda key, x: x * 2 if key == "observations" else x,
-    "other rewards": lambda key, x: x * 100 if key == "rewards" else x,
+    "one reward": lambda key, x: np.r_[x[:-1], 9] if key == "rewards" else x,
     "other actions": lambda key, x: -x if key == "actions" else x,
     "fewer rows": lambda key, x: x[:-1000],
 }
